@@ -165,6 +165,7 @@ def require_fitting(config: Config, models: Models) -> None:
         )
 
 
+@checks.typed
 def make_jmvae(config: Config) -> Jmvae:
     """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
@@ -205,6 +206,7 @@ def make_prior(config: Config) -> Belief:
     return fusion.prior(make_jmvae(config), config.mdp.unseen_variance)
 
 
+@checks.typed
 def make_bayes(config: Config) -> Bayes:
     """Makes the exact Bayes filter over the classes of a configuration."""
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
@@ -238,6 +240,7 @@ def make_readout(config: Config, classes: Belief) -> Readout:
     return readout.make(classes, readout.directions(make_jmvae(config).feature_sizes))
 
 
+@checks.typed
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
     """Makes the paper's fusion in place, see `vae.InPlace`.
 

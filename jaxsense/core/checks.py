@@ -3,8 +3,12 @@
 Traced values are unknown: their checks pass and cost nothing.
 """
 
+import dataclasses
+import functools
+import inspect
 from collections.abc import Callable, Sequence
 from types import EllipsisType
+from typing import ParamSpec, Protocol, TypeVar, get_type_hints
 
 import chex
 import jax
@@ -14,6 +18,9 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from jaxsense.core.types import Belief
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _MOST_SHOWN = 80  # characters of a value
 _ARRAYS = jax.Array | np.ndarray | np.generic | float | int
@@ -208,6 +215,35 @@ def require_type(name: str, value: object, kind: type, source: str) -> None:
     if not isinstance(value, kind):
         expected = f"must be {kind.__name__}, {source}"
         raise ValueError(f"{name} = {_shown(value)}: {expected}")
+
+
+def typed(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of a public function: arguments must be of the classes that annotate them.
+
+    Checks dataclasses, and members of protocols; raises `ValueError` for another class.
+    """
+    hints: dict[str, type] = {
+        n: kind for n, kind in get_type_hints(function).items() if _is_own(kind)
+    }
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if (kind := hints.get(name)) is None:
+                continue
+            if dataclasses.is_dataclass(kind):
+                require_type(name, value, kind, f"of {kind.__module__}")
+            else:
+                require_members(name, value, kind)
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def _is_own(kind: object) -> bool:
+    """Whether a class is a dataclass or a protocol."""
+    return isinstance(kind, type) and (dataclasses.is_dataclass(kind) or Protocol in kind.__bases__)
 
 
 def require_belief(name: str, belief: Belief, size: int | None = None) -> None:

@@ -35,6 +35,8 @@ def pytree(cls: type[T]) -> type[T]:
 
     Fields with `flax.struct.field(pytree_node=False)` are static and may hold any hashable value.
     """
+    if not isinstance(cls, type):
+        raise ValueError(f"cls = {cls!r}: must be a class")
     made: Any = dataclasses.dataclass(frozen=True)(cls)
     fields = dataclasses.fields(made)
     leaves = [field.name for field in fields if field.metadata.get("pytree_node", True)]

@@ -197,6 +197,7 @@ class MapAgent:
         return MLP(self.hidden, self.num_pois + 1)
 
 
+@checks.typed
 def observation(belief: Belief) -> Float[Array, " S"]:
     """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI.
 

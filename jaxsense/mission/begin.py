@@ -28,6 +28,7 @@ _NUM_CANDIDATES = 32  # positions drawn for each robot
 _CHECKED_AT_ONCE = 4  # of them, since one of the first has room nearly always
 
 
+@checks.typed
 def reset(
     key: Key,
     mission: Mission,
@@ -68,6 +69,7 @@ def reset(
     return start(mission, models, scene, classes, policy, faults, paths, error)
 
 
+@checks.typed
 def start(
     mission: Mission,
     models: Models,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.objects import require_words
+from jaxsense.core import checks
 from jaxsense.dqn.policies import POLICIES, Policy, Values, table
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.sim import sensors
@@ -29,6 +30,7 @@ class Case:
     faults: Faults
 
 
+@checks.typed
 def require_playable(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
     """Checks that missions can be made and their policies exist, before anything is trained.
 
@@ -61,9 +63,11 @@ def _require_names(policies: Iterable[str]) -> None:
 
 def is_fault(case: str) -> bool:
     """Tells from the name of a case whether a robot is alone, stops or goes blind in it."""
+    checks.require_type("case", case, str, "as from cases")
     return case.endswith(tuple(f"_{fault}" for fault in _FAULTS))
 
 
+@checks.typed
 def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
     """Lists a case for every policy, for each robot alone, and for each robot that fails.
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
+from jaxsense.core import checks
 from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
 from jaxsense.models import Models
@@ -24,6 +25,7 @@ to even when it retried; `undetected`: it gave one up after looks that showed no
 `robot failed`: the others finished."""
 
 
+@checks.typed
 def reason(state: MissionState) -> Int[Array, ""]:
     """Returns why a mission ended, as an index into `REASONS`."""
     robots = state.robots
@@ -43,6 +45,7 @@ def reason(state: MissionState) -> Int[Array, ""]:
     return code
 
 
+@checks.typed
 def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, PyTree[Array]]:
     """Computes the metrics of a finished mission.
 

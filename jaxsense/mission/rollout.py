@@ -51,6 +51,7 @@ def rollout(
     return jax.tree.map(lambda x: x[0], batch)
 
 
+@checks.typed
 def rollout_batch(
     keys: Key,
     mission: Mission,
@@ -83,6 +84,7 @@ def rollout_batch(
 
 
 @jax.named_scope("mission.step")
+@checks.typed
 def step(
     keys: Key, mission: Mission, models: Models, states: MissionState
 ) -> tuple[MissionState, Record]:

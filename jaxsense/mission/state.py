@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
 from jaxsense.mission.memory import Memory
@@ -243,6 +244,7 @@ class Mission:
         return state.steps * self.config.mission.control_period
 
 
+@checks.typed
 def make_mission(
     config: Config,
     policies: Mapping[str, Values | Policy] | None = None,
@@ -272,6 +274,7 @@ def make_mission(
     )
 
 
+@checks.typed
 def no_faults(config: Config) -> Faults:
     """Makes the faults of robots that never fail."""
     never = jnp.full(len(config.carried), jnp.inf, jnp.float32)

@@ -89,6 +89,7 @@ class Arena:
         )
 
 
+@checks.typed
 def build(
     config: ArenaConfig,
     lidar_robots: tuple[bool, ...],
@@ -190,6 +191,7 @@ def _check_pois(config: ArenaConfig, name: str, value: jax.Array) -> None:
         raise ValueError(f"{name} of {number} PoIs: must be {config.num_pois}, as arena.num_pois")
 
 
+@checks.typed
 def make_layout(
     config: ArenaConfig,
     position: Float[Array, "N 2"],
@@ -253,6 +255,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     return make_layout(config, corner + cell_side / 2 + offset, yaw, classes)
 
 
+@checks.typed
 def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
     """Places PoIs and robots at rest, and all their geoms.
 
@@ -325,11 +328,13 @@ def check_layout(config: ArenaConfig, layout: Layout) -> None:
         checks.require_shape(f"layout.{name}", getattr(layout, name), (config.num_pois, *shape))
 
 
+@checks.typed
 def robot_poses(data: mjx.Data) -> Float[Array, "R 3"]:
     """Reads x [m], y [m] and yaw [rad] of each robot from the MJX state."""
     return data.qpos.reshape(-1, 3)
 
 
+@checks.typed
 def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mjx.Data:
     """Advances the physics by `TIMESTEP` seconds with commanded wheel speeds.
 

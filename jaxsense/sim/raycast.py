@@ -70,6 +70,7 @@ class Hit:
     normal: tuple[jax.Array, jax.Array]
 
 
+@checks.typed
 def cross_section(
     arena: Arena, data: mjx.Data, height: Float[Array, ""] | float, robot: int
 ) -> CrossSection:
@@ -228,6 +229,8 @@ def choose(
     Returns:
       The chosen value for each index.
     """
+    checks.require_shape("table", table, (None,))
+    checks.require_shape("index", index, (...,))
     return functools.reduce(
         lambda chosen, i: jnp.where(index == i, table[i], chosen), range(len(table)), table[0]
     )

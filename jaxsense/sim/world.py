@@ -54,6 +54,7 @@ class Scene:
     poses: jax.Array
 
 
+@checks.typed
 def make_world(
     config: Config,
     robots: tuple[str, ...] | None = None,

@@ -4,6 +4,7 @@ import jax
 from jax.tree_util import Partial
 from jaxtyping import Array, Float, Int
 
+from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
 from jaxsense.dqn import policies
@@ -12,6 +13,7 @@ from jaxsense.tasks.score import Policy
 from jaxsense.tasks.task import Task
 
 
+@checks.typed
 def greedy(task: Task, agent: Agent, params: Params) -> Policy:
     """Makes a policy for `score` that takes the action with the highest Q-value.
 

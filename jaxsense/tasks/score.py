@@ -214,6 +214,7 @@ def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
     Args:
       values: `[seeds]`.
     """
+    checks.require_shape("values", values, (None,))
 
     def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
         return stats.trim_mean(values, 0.25, axis=axis)

@@ -115,6 +115,7 @@ def logits(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " D
     return networks.apply(_network(detector), detector.params, _standard(detector, window))
 
 
+@checks.typed
 def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
     """Computes the features of a look that shows its PoI; `answer` also checks that it does.
 
@@ -128,6 +129,7 @@ def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m
     return detector.features(window)
 
 
+@checks.typed
 def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
     """Evaluates a look: whether the window shows its PoI, and the features.
 

@@ -90,6 +90,7 @@ class InPlace:
         return jnp.argmax(self.class_probabilities(belief))
 
 
+@checks.typed
 def fuse(
     params: Params,
     model: Jmvae,
@@ -206,6 +207,7 @@ def train_decoders(
     return {**params, "decoders": state.params}
 
 
+@checks.typed
 def prior(model: Jmvae, variance: float) -> Belief:
     """Makes the belief before any look, with mean 0.
 

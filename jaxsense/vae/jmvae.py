@@ -109,6 +109,7 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
     return {"encoders": encoders, "decoders": decoders}
 
 
+@checks.typed
 def encode(
     params: Params, model: Jmvae, features: Features
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
@@ -148,6 +149,7 @@ def _encode(
     return mean, log_var
 
 
+@checks.typed
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
     """Decodes a latent into the mean of `p(features | z)` for every modality.
 
@@ -171,6 +173,7 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
     )
 
 
+@checks.typed
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
     """Encodes features into a belief, the posterior `q(z | present features)`; see `encode`.
 

@@ -31,6 +31,7 @@ _MAX_UNROLLED = 4  # eliminations; a program with many takes minutes to compile
 _THRESHOLD = 0.05  # of the largest singular value; smaller differences of moments are noise
 
 
+@checks.typed
 def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     """Computes the belief with the moments of a mixture of the classes.
 
