@@ -8,6 +8,8 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, Float, PyTree
 
+from jaxsense.core.types import product
+
 Params = PyTree
 """A pytree of network parameters."""
 
@@ -26,9 +28,7 @@ class Dense(nn.Module):
         """Maps `[F]` to `[size]`, or `[F, B]` to `[size, B]`."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[0], self.size))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.size,))
-        # In full precision, so that an accelerator agrees with a CPU.
-        y = jnp.matmul(kernel.T, x, precision=jax.lax.Precision.HIGHEST)
-        return y + bias.reshape(-1, *[1] * (x.ndim - 1))
+        return product(kernel.T, x) + bias.reshape(-1, *[1] * (x.ndim - 1))
 
 
 class MLP(nn.Module):

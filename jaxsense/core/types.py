@@ -25,6 +25,9 @@ Features = tuple[Float[Array, "_"] | None, ...]
 Scene = PyTree
 """A pytree that describes what looks see; MDPs only carry it."""
 
+product = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+"""Matrix product in full float32, so that an accelerator agrees with a CPU."""
+
 Samples = tuple[Float[Array, "C _ _"], ...]
 """`[C, S, D_m]` features of each modality: S looks at every class."""
 

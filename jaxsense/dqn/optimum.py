@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, pytree
+from jaxsense.core.types import Belief, product, pytree
 from jaxsense.dqn.rewards import Reward
 
 MAX_POINTS = 2**13
@@ -75,7 +75,7 @@ class LookValues:
 
     def _read(self, table: jax.Array, probabilities: jax.Array) -> jax.Array:
         """A table at class probabilities."""
-        of_labels = probabilities if self.labels is None else probabilities @ self.labels
+        of_labels = probabilities if self.labels is None else product(probabilities, self.labels)
         return interpolate(table, of_labels)
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import CommunicationConfig
-from jaxsense.core.types import Belief, Fusion, Index, Key, pytree
+from jaxsense.core.types import Belief, Fusion, Index, Key, product, pytree
 from jaxsense.vae import readout
 
 MOST_LOOKS = 256
@@ -101,7 +101,7 @@ class Memory:
         is_at = (jnp.arange(num_pois)[:, None, None] == self.poi[None]) & known[None]
         flat = values.reshape(-1, values.shape[-1])
         is_at = is_at.reshape(num_pois, -1).astype(values.dtype)
-        return jnp.matmul(is_at, flat, precision=jax.lax.Precision.HIGHEST)
+        return product(is_at, flat)
 
     def apart(
         self,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import ArenaConfig, NavigationConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Index, others
+from jaxsense.core.types import Index, others, product
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 
@@ -312,7 +312,7 @@ def sidestep(
     def beside(other: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Position next to another robot, and whether to go there."""
         to_other = other - position
-        ahead, aside = jnp.dot(to_other, along), jnp.dot(to_other, right)
+        ahead, aside = product(to_other, along), product(to_other, right)
         blocks = (jnp.abs(aside) < keep - _SIDESTEP / 2) & (ahead > 0) & (ahead < length)
         # On the tangents to a circle around the other robot, or outwards from inside the circle.
         apart = jnp.maximum(jnp.linalg.norm(to_other), 1e-6)

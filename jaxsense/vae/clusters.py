@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, product
 
 _TRIES = 16
 _STEPS = 30
@@ -67,7 +67,7 @@ def _one(key: Key, points: jax.Array, number: int) -> tuple[jax.Array, jax.Array
     def move(centres: jax.Array, _: None) -> tuple[jax.Array, None]:
         is_member = jax.nn.one_hot(nearest(points, centres), number)
         counts = jnp.sum(is_member, axis=0)[:, None]
-        moved = jnp.matmul(is_member.T, points, precision=jax.lax.Precision.HIGHEST)
+        moved = product(is_member.T, points)
         return jnp.where(counts > 0, moved / jnp.maximum(counts, 1), centres), None
 
     found, _ = jax.lax.scan(move, chosen, None, _STEPS)

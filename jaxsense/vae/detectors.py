@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import DetectorConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Key, pytree
+from jaxsense.core.types import Key, product, pytree
 from jaxsense.vae import gate as gates
 from jaxsense.vae.gate import Gate
 
@@ -176,7 +176,7 @@ def search(
     is_there = jnp.any(may_be) & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
     share = jax.nn.softmax(odds).reshape(may_be.shape).sum(axis=0)
     logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
-    pooled = jax.nn.softmax(share @ logs)
+    pooled = jax.nn.softmax(product(share, logs))
     return Detection(is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
 
 

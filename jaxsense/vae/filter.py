@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import FilterConfig
 from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Key, Samples, pytree
+from jaxsense.core.types import Belief, Key, Samples, product, pytree
 from jaxsense.vae import gaussian, readout
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.readout import Readout
@@ -117,7 +117,7 @@ class Filter:
         network = MLP(self.hidden, moments.shape[1])
         logarithm = jnp.log(jnp.maximum(features, _MIN_FEATURE))
         found = networks.apply(network, params[self.model.modalities[modality]], logarithm)
-        return jnp.matmul(moments, found, precision=jax.lax.Precision.HIGHEST)
+        return product(moments, found)
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""

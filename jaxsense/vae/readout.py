@@ -8,7 +8,6 @@ the log-posterior of the looks is linear in `T`, as it is where the labels of ea
 latent directions of their own.
 """
 
-import functools
 from collections.abc import Sequence
 
 import jax
@@ -16,13 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Index, pytree
+from jaxsense.core.types import Belief, Index, product, pytree
 
 MIN_PROBABILITY = 1e-6
 """Minimum class probability that can be read; float32 moments hold no smaller ones."""
 
-# In full precision, so that an accelerator agrees with a CPU.
-_dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 _STEPS = 25  # of Newton's method
 _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
@@ -47,9 +44,9 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     """
     checks.require_shape("probabilities", probabilities, classes.mean.shape[:1])
     checks.require_probabilities("probabilities", probabilities)
-    mean = _dot(probabilities, classes.mean)
+    mean = product(probabilities, classes.mean)
     spread = classes.std**2 + (classes.mean - mean[None]) ** 2
-    return Belief(mean, jnp.sqrt(_dot(probabilities, spread)))
+    return Belief(mean, jnp.sqrt(product(probabilities, spread)))
 
 
 def divergence(held: Float[Array, " C"], read: Float[Array, " C"]) -> Float[Array, ""]:
@@ -101,19 +98,19 @@ class Readout:
 
     def _of_maximum_entropy(self, belief: Belief) -> jax.Array:
         """`[C]` probabilities whose moments are the belief's, by a damped Newton iteration."""
-        target = _dot(_moments(belief) - self.offset, self.whitening)
+        target = product(_moments(belief) - self.offset, self.whitening)
 
         def step(_: int, theta: jax.Array) -> jax.Array:
-            probabilities = jax.nn.softmax(_dot(self.of_classes, theta))
-            expected = _dot(probabilities, self.of_classes)
+            probabilities = jax.nn.softmax(product(self.of_classes, theta))
+            expected = product(probabilities, self.of_classes)
             apart = self.of_classes - expected[None]
-            hessian = _dot((apart * probabilities[:, None]).T, apart)
+            hessian = product((apart * probabilities[:, None]).T, apart)
             move = _solve(hessian + _DAMPING * jnp.eye(len(theta)), target - expected)
             length = jnp.sqrt(jnp.sum(move**2) + 1e-12)
             return theta + move * jnp.minimum(1.0, _LONGEST / length)
 
         theta = jax.lax.fori_loop(0, _STEPS, step, jnp.zeros_like(target))
-        return jax.nn.softmax(_dot(self.of_classes, theta))
+        return jax.nn.softmax(product(self.of_classes, theta))
 
 
 def make(classes: Belief, most: int | None = None) -> Readout:
@@ -136,7 +133,7 @@ def make(classes: Belief, most: int | None = None) -> Readout:
     is_kept = singular > _THRESHOLD * singular[0]
     length = jnp.where(is_kept, jnp.sqrt(len(moments)) / jnp.where(is_kept, singular, 1.0), 0.0)
     whitening = axes.T * length[None]
-    return Readout(_dot(moments - offset[None], whitening), offset, whitening)
+    return Readout(product(moments - offset[None], whitening), offset, whitening)
 
 
 def directions(numbers: Sequence[int]) -> int:

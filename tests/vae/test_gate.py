@@ -1,6 +1,7 @@
 """Gates on windows whose answer is known."""
 
 import functools
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from jaxsense.config import DetectorConfig
 from jaxsense.core import supervised
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.vae import detectors, gate
 
 CONFIG = DetectorConfig(hidden=(8,), steps=300, batch=64, learning_rate=1e-2)
@@ -220,3 +222,16 @@ class Read:
     def features(self, window):
         probability = jax.nn.sigmoid(window[1])
         return jnp.stack([probability, 1 - probability])
+
+
+def test_no_product_of_a_search_or_a_value_has_the_precision_of_the_device():
+    windows = jax.random.normal(jax.random.key(0), (20, RAYS))
+    detector = detectors.init(jax.random.key(1), windows, 3, CONFIG)
+    values = LookValues(jnp.ones(3), jnp.ones(3), *jnp.ones(2), jnp.ones((4, 2)))
+    for traced in (
+        jax.make_jaxpr(detectors.search)(detector, windows, jnp.ones(2), jnp.zeros((2, 20))),
+        jax.make_jaxpr(values.of_next)(jnp.full(4, 0.25), jnp.bool_(True)),
+    ):
+        products = re.findall(r"dot_general\[(.*?)\] ", str(traced), re.DOTALL)
+        assert products
+        assert all("precision=(Precision.HIGHEST" in each for each in products), products
