@@ -20,7 +20,6 @@ from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.missions import Played, Player
 from jaxsense.run.monitor import Monitor
-from jaxsense.summary import profile
 
 _UNIT = "control-steps/s"
 # For each accelerator.
@@ -100,7 +99,7 @@ def _play(
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
-        compile_s = profile.of_stages(compiler.monitor.clock.spans)["mission"]["compile_s"]
+        compile_s = compiler.monitor.stopwatch.timing(1)["stages"]["mission"]["compile_s"]
         return Side(run, run().control_steps, batch, compile_s, workers.number)
 
     with contextlib.ExitStack() as stack:

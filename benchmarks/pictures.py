@@ -127,20 +127,6 @@ def _of_run(train: str, **names: str) -> Written:
     return Written((f"{train} --out {FOLDER}/run",), files)
 
 
-def _of_recording(preset: str, picture: str) -> Written:
-    """Residuals of real scans, with a run of a preset."""
-    run, scans = f"{FOLDER}/run", f"{FOLDER}/scans.npz"
-    compare = f"import jaxsense; print(jaxsense.compare_scans('{run}', '{scans}'))"
-    return Written(
-        (
-            f"python -m jaxsense.train --preset {preset} --out {run}",
-            f"python examples/laser_logs.py {run} {scans}",
-            f'python -c "{compare}"',
-        ),
-        {f"figures/{picture}": "scans.npz.residuals.svg"},
-    )
-
-
 def _film(words: str, picture: str) -> Written:
     """A film of a mission with models that ship with the package."""
     return Written(
@@ -202,8 +188,6 @@ DRAWINGS: tuple[Drawing, ...] = (
         noisy_calibration="calibration",
         noisy_policies="policies",
     ),
-    _of_recording("default", "recorded_residuals.svg"),
-    _of_recording("recorded", "recorded_residuals_fitted.svg"),
 )
 """What draws the pictures of `docs`."""
 

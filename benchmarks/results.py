@@ -23,7 +23,6 @@ from benchmarks import (
     measure,
     pipeline,
     place,
-    recorded,
     same_accuracy,
     studies,
     travel,
@@ -195,7 +194,6 @@ TABLES: Mapping[str, _Tables] = {
             programs=("detect_camera", "detect_lidar", "write_lidar", "decide", "classify"),
         ),
     },
-    "recorded.json": {None: recorded.table, "noise": recorded.of_noise},
 }
 """What makes each table of a file, by their names."""
 

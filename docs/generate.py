@@ -153,7 +153,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 PACKAGES = ("", "config", "sim", "vae", "dqn", "mission", "training", "tasks", "interfaces")
 """Packages whose names are public; the first is `jaxsense` itself."""
-_EXTRAS = "gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo", "rawlog"
+_EXTRAS = "gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo"
 _DEFINITION = ast.FunctionDef | ast.ClassDef
 
 

@@ -12,8 +12,8 @@ Your own recording can come from anywhere. It must hold, for C PoIs:
     NAME_scans  [C, B, ...]  what all its B rays read: metres, or linear RGB from 0 to 1
     NAME_angles [B]          their directions in radians, if they are not those of the run
 
-A sensor may be missing. Scans along other rays are resampled; `laser_logs.py` makes some of real
-ones. A run with custom sensors needs `--trust`, because their functions are imported.
+A sensor may be missing. Scans along other rays are resampled. A run with custom sensors needs
+`--trust`, because their functions are imported.
 """
 
 import argparse

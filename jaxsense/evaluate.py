@@ -24,7 +24,7 @@ from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, drawing, mission_plots, page, tables
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.summary import compare, profile
+from jaxsense.summary import compare
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS
 
@@ -192,7 +192,7 @@ def _report(run: Path, config: Config) -> Path:
     places = [_evaluation(config, own["mission"]), *found.values()]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
         files.write(run / "teams.svg", drawing.svg(mission_plots.teams(places)))
-    files.write(path, page.render(run, config, own, found, profile.read(run)))
+    files.write(path, page.render(run, config, own, found))
     return path
 
 

@@ -22,7 +22,6 @@ from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
-from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -33,7 +32,7 @@ from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, print_table, say
-from jaxsense.summary import compare, profile, statistics
+from jaxsense.summary import compare, statistics
 from jaxsense.summary.blocks import Header
 
 PROGRAM = "jaxsense.train"
@@ -110,9 +109,7 @@ def main(
       change: changes a preset in your own program, before the other options do.
       policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
-    # The process may have run others before, unless its own command line asks for this.
-    clock = Clock(process_start() if argv is None else None)
-    clock.add_rest("import")
+    monitor = Monitor(warn=_warn)
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
     is_quiet, is_first = arguments.quiet, not arguments.process_index
     if not is_first:
@@ -131,7 +128,7 @@ def main(
                 begins=lambda: None if is_quiet else say(waits),
             )
             workers = devices.start(arguments.devices)
-            _train(clock, arguments, run, workers, console, policies)
+            _train(monitor, arguments, run, workers, console, policies)
         processes.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
@@ -232,7 +229,7 @@ def _discarded(settings: Settings) -> Iterator[RunDirectory]:
 
 
 def _train(
-    clock: Clock,
+    monitor: Monitor,
     arguments: Arguments,
     run: RunDirectory,
     workers: Workers,
@@ -242,7 +239,6 @@ def _train(
     """Trains all seeds with the same programs, and writes their results."""
     settings, failed = run.settings, dict[int, str]()
     kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config, has_own_code=bool(policies))
-    monitor = Monitor(warn=_warn, clock=clock)
 
     def stop() -> None:
         monitor.stop()
@@ -271,7 +267,7 @@ def _train(
                         for seed, path in left[first : first + size]
                     ]
                     failed |= _train_together(arguments, runs, programs, monitor, console)
-                clock.restart()
+                monitor.stopwatch.restart()
     except Stopped:
         if jax.process_index() == 0:
             again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
@@ -305,7 +301,7 @@ def _train_together(
 
     displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
-    clock, artist = monitor.clock, Artist(monitor.clock)
+    artist, failed = Artist(), dict[int, str]()
 
     def train(i: int) -> summary.Results | StageError:
         run, config = runs[i], runs[i].settings.config
@@ -322,14 +318,11 @@ def _train_together(
         finally:
             programs.trainings.leave()
 
-    clock.add_rest("start")
-    failed: dict[int, str] = {}
     with displays[0], artist:
         monitor.begin(displays[0].show)
         results = devices.side_by_side(train, len(runs))
         drawn = artist.finished()
-        stages = profile.of_stages(clock.spans)
-        timing = statistics.timing(clock.now - clock.begin, stages, len(runs))
+        timing = monitor.stopwatch.timing(len(runs))
         for run, result in zip(runs, results, strict=True):
             if isinstance(result, StageError):
                 failed[run.settings.seed] = str(result)
@@ -337,7 +330,7 @@ def _train_together(
                 continue
             monitor.check_stop()
             found: summary.Summary = {**_header(run), "timing": timing, **result}
-            _report().write(run, drawn[run.path], found, clock)
+            _report().write(run, drawn[run.path], found)
             monitor.check_stop()
             # Last, for it marks the run as finished.
             rundir.write_json(run.path / "summary.json", found)

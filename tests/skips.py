@@ -10,7 +10,6 @@ EXPECTED = (
     "multivae",
     # Not a package of Python.
     "none of chromium",
-    "mrpt-common",
     "Python 3.11 is not installed",
     "Python 3.12 is not installed",
     # Away from the source, or in a shallow clone.

@@ -165,7 +165,7 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
 import os, sys
 from jaxsense import train
 from jaxsense.run import cli
-train._train = lambda clock, arguments, run, *more: (run.path / "summary.json").write_text(
+train._train = lambda monitor, arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 resume = lambda: train.main(["--resume", sys.argv[2]])
 cli.run(resume)
@@ -267,7 +267,7 @@ def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run
     # Plots of policies come from each set of arenas; the two films of a training share a frame.
     for report, episodes, frames, policies in ((smoke_run, 4, 1, 1), (path, 1, 2, 2)):
         text = (report / "report.html").read_text()
-        assert text.count("image/svg+xml") == 5 + policies
+        assert text.count("image/svg+xml") == 4 + policies
         assert text.count("<iframe sandbox") == frames
         assert f"{episodes} missions of each policy" in text
 

@@ -21,7 +21,6 @@ from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
 from jaxsense.dqn import policies
 from jaxsense.dqn.reference import reference
-from jaxsense.interfaces import rawlog
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.training import learn, stages
 from jaxsense.vae import InPlace
@@ -202,48 +201,6 @@ def test_recorded_scans_neither_invents_nor_replaces_a_recording(
     assert "\n" not in str(stop.value)
     assert capsys.readouterr().out == ""
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"] * is_there
-
-
-@pytest.mark.slow  # trains a run with a thermal camera
-@pytest.mark.skipif(not rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
-def test_laser_logs(example, trained_recorded_scans, trained_runs, tmp_path, monkeypatch, capsys):
-    main, read_logs = example("laser_logs").main, rawlog.read_logs
-
-    def few(directory):
-        scans = read_logs(directory)
-        return rawlog.LaserScans(scans.angles, scans.ranges[::20])
-
-    # The example needs no custom sensors, and so no option to trust those of this run.
-    load = jaxsense.load
-    monkeypatch.setattr(jaxsense, "load", lambda run, trust=True: load(run, True))
-    monkeypatch.setattr(rawlog, "read_logs", few)
-    recording = tmp_path / "scans.npz"
-    main([str(trained_runs / "thermal"), str(recording)])
-    content = np.load(recording)
-    number = len(content["places"])
-    assert 30 < number <= 36
-    assert content["lidar_scans"].shape == (number, 361)
-    distance = np.linalg.norm(content["places"], axis=1)
-    assert ((distance >= 0.3) & (distance <= 1.2)).all()
-    # No look is out of view, and most show their PoI.
-    trained_recorded_scans(recording)
-    told = capsys.readouterr().out
-    assert told.count("lidar: cylinder") + told.count("lidar: uncertain") > 0.8 * number
-    assert "thermal" not in told
-    before = recording.read_bytes()
-    with pytest.raises(SystemExit, match=r"^laser_logs: .*scans\.npz"):
-        main([str(trained_runs / "thermal"), str(recording)])
-    assert recording.read_bytes() == before
-
-
-def test_laser_logs_names_a_missing_log(example, runs, tmp_path, monkeypatch):
-    load = jaxsense.load
-    monkeypatch.setattr(jaxsense, "load", lambda run, trust=False: load(run, True))
-    argv = [str(runs / "thermal"), str(tmp_path / "scans.npz"), "--logs", str(tmp_path)]
-    with pytest.raises(SystemExit, match=r"^laser_logs: .*SENA_Telecom") as stop:
-        example("laser_logs").main(argv)
-    assert "\n" not in str(stop.value)
-    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.slow

@@ -419,15 +419,3 @@ def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
 
     with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
         run_chunks(chunked("jmvae", 4), np.float32(0), run, Monitor(), checkpoints)
-
-
-def test_saving_counts_for_the_programs_that_stages_share(tmp_path):
-    monitor = Monitor()
-
-    def run(chunk, state):
-        monitor.stop()
-        return state, {"chunk": [chunk]}
-
-    stage = chunked("dqn_camera", 1, shares="dqn")
-    run_chunks(stage, np.float32(0), run, monitor, Checkpoints(tmp_path))
-    assert [(span.kind, span.stage) for span in monitor.clock.spans] == [("save", "dqn")]

@@ -20,7 +20,6 @@ import jaxsense
 from jaxsense import mission, summary
 from jaxsense.show import animation, drawing, page
 from jaxsense.summary import compare, statistics
-from jaxsense.summary.profile import Span
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
@@ -132,16 +131,6 @@ def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
     assert "<td><b>13.8</b></td>" in text
     assert "<b>9.0</b>" not in text
     assert "By median times, the latent policy is 8 % faster than naive exploration." in text
-
-
-def test_what_took_longest_stands_below_the_chart(tmp_path):
-    run = write_run(tmp_path)
-    spans = [Span("run", "mission", "", "MainThread", 0.0, 4.0)]
-    assert "largest part" not in page.render(run, CONFIG, SUMMARY, spans=spans)
-    (run / "timing.svg").write_bytes(drawing.svg(Figure(figsize=(1, 1))))
-    text = page.render(run, CONFIG, SUMMARY, spans=spans)
-    assert "The largest part of 4.0 s was running mission: 4.0 s." in text
-    assert "None In each" not in page.render(run, CONFIG, SUMMARY)
 
 
 @pytest.mark.parametrize("change", [{"num_permutations": 0}, {"num_permutations": 200}])

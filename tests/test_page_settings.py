@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import jaxsense
-from benchmarks import exported, recorded
+from benchmarks import exported
 from benchmarks.fusions import study
 from benchmarks.raw import training, variants
 from benchmarks.results import RESULTS
@@ -116,10 +116,6 @@ def _sizes():
 def _of_studies():
     """The same, of benchmarks."""
     yield f"the same {study._HISTORIES:,} histories"
-    found = json.loads((RESULTS / "recorded.json").read_text(encoding="utf-8"))
-    yield f"{found['scans']} real laser scans"
-    yield f"four logs with {found['scans']} scans"
-    yield f"fitted to the {found['scans']} scans"
     camera, lidar = (x.window * x.channels for x in sim.sensors.make(PRESETS["default"]))
     yield f"explain {camera} numbers from a camera or {lidar} from a LiDAR"
     yield f"both sensors have {camera} of them"
@@ -133,7 +129,6 @@ def _of_studies():
     yield f"hidden layers of {sizes[0]} units"
     heaviest = max(max(x.jmvae.reconstruction_weights) for x in variants.ABLATION)
     yield f"weights of {heaviest:,.0f} cost little"
-    yield f"learn from {recorded._LABELLED} windows"
 
 
 CONSTANTS = {

@@ -299,7 +299,7 @@ def write(monkeypatch, tmp_path, patient):
         report = SimpleNamespace(
             of_training=lambda config, learned: {"curve": learned.results["after"]},
             of_missions=lambda config, learned, played: {"film": played.missions},
-            write=lambda run, pictures, found, clock: drawn.update({run.settings.seed: pictures}),
+            write=lambda run, pictures, found: drawn.update({run.settings.seed: pictures}),
         )
         monkeypatch.setattr(command, "_report", lambda: report)
         monkeypatch.setattr(programs, "stages", lambda config: walks(farthest))

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import itertools
 import json
 import re
 import subprocess
@@ -23,16 +22,15 @@ from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import report
-from jaxsense.summary import profile
 
 PIPES = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 
 
 def test_run_directory_holds_everything(smoke_run):
     names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
-    names_of_plots = "latent_space", "reward", "scanlines", "calibration", "policies", "timing"
+    names_of_plots = "latent_space", "reward", "scanlines", "calibration", "policies"
     plots = {f"{name}.svg" for name in names_of_plots}
-    others = {"config.json", "metrics.jsonl", "summary.json", "timing.json", "checkpoints"}
+    others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
     films = {"mission.svg", "mission-naive.svg"}
     assert names == {*others, *plots, *films, "report.html", ".lock"}
     for picture in plots | films:
@@ -115,24 +113,15 @@ def test_a_run_of_smoke_ends_by_saying_what_it_is_good_for(smoke_run, monkeypatc
     assert following == f"Next: python -m jaxsense.evaluate {smoke_run} --animate"
 
 
-def test_the_time_of_a_run_adds_up(smoke_run):
-    spans = profile.read(smoke_run)
+def test_the_time_of_a_run_covers_its_stages(smoke_run):
+    timing = json.loads((smoke_run / "summary.json").read_text())["timing"]
     written = [(smoke_run / name).stat().st_mtime for name in ("config.json", "summary.json")]
-    wall = written[1] - written[0]
-    main = [span for span in spans if span.thread == profile.MAIN]
-    start = sum(span.seconds for span in main if span.kind in ("import", "start"))
-    # The settings are written while the run starts.
-    assert 0.95 * wall <= sum(span.seconds for span in main) <= 1.05 * (wall + start)
-    assert sum(profile.parts(spans).values()) == pytest.approx(
-        max(s.end_s for s in spans), rel=0.05
-    )
-    for thread in {span.thread for span in spans}:
-        of_thread = [span for span in spans if span.thread == thread]
-        for before, after in itertools.pairwise(of_thread):
-            assert before.start_s <= before.end_s <= after.start_s + 1e-4, (before, after)
-    kinds = {span.kind for span in spans}
-    assert {"start", "trace", "lower", "compile", "run", "save", "summarise", "draw"} <= kinds
-    assert {"detector_camera", "jmvae", "dqn", "mission"} <= {span.stage for span in spans}
+    # The page is written after the time is taken.
+    assert 0.8 * (written[1] - written[0]) <= timing["total_s"] <= written[1] - written[0] + 5
+    assert {"detector_camera", "jmvae", "dqn", "mission"} <= set(timing["stages"])
+    for stage in timing["stages"].values():
+        assert 0 < stage["run_s"] < timing["total_s"]
+        assert stage["compile_s"] > 0
 
 
 def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):

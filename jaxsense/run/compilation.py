@@ -1,11 +1,11 @@
 """Compiles programs in the background."""
 
 import contextlib
-import functools
-import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from types import TracebackType
+from typing import Literal
 
 import jax
 from jaxtyping import PyTree
@@ -15,14 +15,12 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.kept import Function, Kept, Traced, shapes_of, trace
 from jaxsense.run.monitor import Monitor
 
-_LOADED = "/jax/compilation_cache/cache_hits"
-
 
 class Compiler:
     """Compiles the programs of a run in its own threads.
 
     Attributes:
-      monitor: its clock records compile times.
+      monitor: measures compile times.
       kept: cache of traced programs, if any.
     """
 
@@ -30,21 +28,9 @@ class Compiler:
         self.monitor, self.kept = monitor, kept
         self._threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
         self._is_closed = False
-        self._loaded = threading.local()
 
     def __enter__(self) -> "Compiler":
-        jax.monitoring.register_event_listener(self._notice)
         return self
-
-    def _notice(self, event: str, **_: str | int) -> None:
-        """Notices that JAX has loaded the program that this thread asked it to compile."""
-        if event == _LOADED:
-            self._loaded.programs = 1 + getattr(self._loaded, "programs", 0)
-
-    @property
-    def num_loaded(self) -> int:
-        """Number of programs that JAX has loaded from its cache in this thread."""
-        return getattr(self._loaded, "programs", 0)
 
     def __exit__(
         self,
@@ -54,7 +40,6 @@ class Compiler:
     ) -> None:
         """Cancels pending work, which would keep the process alive."""
         self._is_closed = True
-        jax.monitoring.unregister_event_listener(self._notice)
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     def check_open(self) -> None:
@@ -86,8 +71,7 @@ class Program:
           name: unique within the stage.
         """
         self._compiler, self._monitor = compiler, compiler.monitor
-        self._stage, self._name, self._clock = stage, name, compiler.monitor.clock
-        self._record = functools.partial(self._clock.record, stage=stage, program=name)
+        self._stage, self._name = stage, name
         self._compiled: Future[Function] = Future()
         self._workers, self._whole, self._results = ALONE, (), None
 
@@ -116,29 +100,30 @@ class Program:
         """
         self._compiler.check_open()
         self._workers, self._whole = workers, whole
-        lowered, results = self._lower(function, args)
+        with self._measure("compile_s"):
+            lowered, results = self._lower(function, args)
         self._results = devices.of_all_parts(results, workers.shares)
 
         def compile_lowered() -> None:
             if self._compiled.done():  # failed or released
                 return
-            begin = self._clock.now
             try:
-                # First, for it compiles and loads programs itself.
-                supported = devices.compiler_options(**options)
-                loaded = self._compiler.num_loaded
-                compiled = lowered.compile(compiler_options=supported)
+                with self._measure("compile_s"):
+                    supported = devices.compiler_options(**options)
+                    compiled = lowered.compile(compiler_options=supported)
             except Exception as error:
                 self.fail(error)
                 return
-            is_new = self._compiler.num_loaded == loaded
-            self._clock.add("compile" if is_new else "load", self._stage, self._name, since=begin)
             with contextlib.suppress(InvalidStateError):  # `fail` was called before
                 self._compiled.set_result(compiled)
             devices.give_back_freed()
 
         self._compiler.submit(compile_lowered)
         return self._results
+
+    def _measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
+        """Adds the seconds of a block to those of the stage."""
+        return self._monitor.stopwatch.measure(kind, self._stage)
 
     def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
         """A function ready to be compiled, and the shapes of a share's results; see `compile`."""
@@ -149,25 +134,22 @@ class Program:
         found = self._found_or_traced(function, share)
         if found is not None:
             spread = devices.spread(found.__call__, workers.mesh, whole)
-            with self._record("lower"):
-                jitted = jax.jit(spread, in_shardings=self._places(len(args)))
-                return jitted.lower(*shapes_of(call)), found.results
-        with self._record("trace"):
-            traced = jax.jit(function).trace(*call)
-        with self._record("lower"):
-            return traced.lower(), traced.out_info
+            jitted = jax.jit(spread, in_shardings=self._places(len(args)))
+            return jitted.lower(*shapes_of(call)), found.results
+        traced = jax.jit(function).trace(*call)
+        return traced.lower(), traced.out_info
 
     def _found_or_traced(self, function: Function, share: tuple[PyTree, ...]) -> Traced | None:
         """The program apart from what calls it, which only caches and meshes need."""
         if (kept := self._compiler.kept) is not None:
             name = f"{self._stage}-{self._name}"
-            found = kept.find_or_trace(name, function, share, self._record)
+            found = kept.find_or_trace(name, function, share)
             if found is not None:
                 return found
         if self._workers.mesh is None:
             return None
         try:
-            return trace(function, share, self._record)
+            return trace(function, share)
         except NotImplementedError as error:
             reason = f"{self._stage}: cannot be split over several devices; use one ({error})"
             raise NotImplementedError(reason) from error
@@ -208,8 +190,7 @@ class Program:
         """
         if not self._compiled.done():
             self._monitor.announce(self._stage)
-            with self._record("wait_program"):
-                return self._monitor.wait_for(self._compiled)
+            return self._monitor.wait_for(self._compiled)
         return self._compiled.result()
 
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
@@ -226,7 +207,7 @@ class Program:
         def run(i: int) -> PyTree:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
-        with self._record("run"):
+        with self._measure("run_s"):
             args = self._put(args)
             output = devices.joined(run, number, self._workers.threads, self._results)
             # Other programs run on one device.

@@ -17,7 +17,6 @@ from jax import export
 from jaxtyping import PyTree
 
 from jaxsense.run import files
-from jaxsense.run.clock import Recorder
 from jaxsense.run.version import versions
 
 Function: TypeAlias = Callable[..., PyTree]
@@ -124,32 +123,27 @@ class Kept:
             return found
         return None
 
-    def find_or_trace(
-        self, name: str, function: Function, args: PyTree, record: Recorder
-    ) -> Traced | None:
+    def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
         """Finds a cached program, or traces and caches a new one.
 
         Args:
           name: of the program.
           function: what to trace.
           args: its arguments or their shapes.
-          record: what is recorded: "load", and if the program is new, "trace" and "lower".
 
         Returns:
           The program; None if it cannot be exported.
         """
-        with record("load"):
-            found = self.find(name, args)
+        found = self.find(name, args)
         if found is not None:
             return found
         # A run must not end because the next one will be slower: where a program calls something
         # that JAX cannot export, or on a full disk.
         traced = None
         with contextlib.suppress(Exception):
-            traced = trace(function, args, record)
-            with record("lower"):
-                content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
-                files.write_digested(self._file(name, args), content, mode=0o600)
+            traced = trace(function, args)
+            content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
+            files.write_digested(self._file(name, args), content, mode=0o600)
         return traced
 
     def _file(self, name: str, args: PyTree) -> Path:
@@ -159,13 +153,12 @@ class Kept:
         return self.path / f"{name}-{digest}.stablehlo"
 
 
-def trace(function: Function, args: PyTree, record: Recorder) -> Traced:
+def trace(function: Function, args: PyTree) -> Traced:
     """Traces a program and lowers it, apart from whatever calls it.
 
     Args:
       function: what to trace.
       args: its arguments or their shapes.
-      record: what is recorded: "trace" and "lower".
 
     Raises:
       NotImplementedError: if it calls something that JAX cannot export, such as the host.
@@ -178,12 +171,8 @@ def trace(function: Function, args: PyTree, record: Recorder) -> Traced:
         results.append(jax.tree.structure(output))
         return jax.tree.leaves(output)
 
-    jitted, shapes = jax.jit(flat), shapes_of(leaves)
-    # Exporting would trace too; JAX does so once.
-    with record("trace"):
-        jitted.trace(*shapes)
-    with record("lower"):
-        return Traced(export.export(jitted)(*shapes), results[-1])
+    exported = export.export(jax.jit(flat))(*shapes_of(leaves))
+    return Traced(exported, results[-1])
 
 
 def use_cache(directory: Path) -> None:

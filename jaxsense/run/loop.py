@@ -5,7 +5,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import AbstractContextManager
 
 import jax
 import numpy as np
@@ -16,7 +15,6 @@ from jaxsense.run import devices
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs, padded, workers_for
-from jaxsense.summary.profile import Kind
 from jaxsense.training.stage import Output, Progress, Stage
 
 _SAVE_PERIOD = 60.0  # s
@@ -108,7 +106,7 @@ class _Loop:
         saver: ThreadPoolExecutor,
     ):
         self._key, self._config = key, config
-        self._programs, self._monitor, self._clock = programs, monitor, monitor.clock
+        self._programs, self._monitor = programs, monitor
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
@@ -126,9 +124,8 @@ class _Loop:
                 before = {name: done[name] for name in stage.sources}
                 done[stage.name] = threads.submit(self._run_stage, stage, before)
             # A wait without timeout may not notice Ctrl-C.
-            with self._clock.record("wait_stages"):
-                while wait(done.values(), timeout=0.2).not_done:
-                    pass
+            while wait(done.values(), timeout=0.2).not_done:
+                pass
         for future in done.values():
             future.result()
         outputs = {name: held.output for name, held in self._held.items() if not held.is_over}
@@ -138,13 +135,8 @@ class _Loop:
 
     def wait_for_saving(self) -> None:
         """Waits until all is saved, and raises the first error."""
-        with self._clock.record("wait_saving"):
-            for each in self._saving:
-                each.result()
-
-    def _record(self, kind: Kind, stage: Stage) -> AbstractContextManager[None]:
-        """Records what is done for a stage, under the name of its programs."""
-        return self._clock.record(kind, stage.program)
+        for each in self._saving:
+            each.result()
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
         """Finds the output of a stage, and lets go of those that no other stage needs."""
@@ -162,9 +154,8 @@ class _Loop:
             found = self._load(stage) if stage.is_saved else None
             if found is not None:
                 return found
-            with self._record("wait_stages", stage):
-                for future in before.values():
-                    future.result()
+            for future in before.values():
+                future.result()
             inputs = stage.select({name: self._held[name].output for name in before})
             self._monitor.check_stop()
             output = (self._train if stage.chunks else self._begin)(stage, inputs)
@@ -249,8 +240,7 @@ class _Loop:
                 return None
             self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
         output = self._programs.of(stage).shapes.result().output
-        with self._record("read", stage):
-            return self._checkpoints.load_or_forget(stage.name, output)
+        return self._checkpoints.load_or_forget(stage.name, output)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
@@ -266,11 +256,10 @@ class _Loop:
             return
 
         def save() -> None:
-            with self._record("save", stage):
-                if stage.chunks:
-                    curves = _as_arrays(self._curves[stage.name])
-                    self._checkpoints.save(f"curves_{stage.name}", curves)
-                self._checkpoints.save(stage.name, output)
+            if stage.chunks:
+                curves = _as_arrays(self._curves[stage.name])
+                self._checkpoints.save(f"curves_{stage.name}", curves)
+            self._checkpoints.save(stage.name, output)
 
         self._saving.append(self._saver.submit(save))
 
@@ -330,8 +319,7 @@ def run_chunks(
             curves.setdefault(name, []).extend(values)
         is_late = time.monotonic() - saved > _SAVE_PERIOD
         if is_late or monitor.is_stopping:
-            with monitor.clock.record("save", stage.program):
-                checkpoints.save_unfinished(stage.name, Unfinished(chunk + 1, state, curves))
+            checkpoints.save_unfinished(stage.name, Unfinished(chunk + 1, state, curves))
             saved = time.monotonic()
         if chunk + 1 < stage.chunks:
             monitor.check_stop()

@@ -255,7 +255,7 @@ class Player:
         with self._lock:  # one call uses the whole machine
             self._monitor.check_finite("mission", "models", models)
             self.wait()
-            with self._monitor.clock.record("run", "mission"):
+            with self._monitor.stopwatch.measure("run_s", "mission"):
                 # Loaded models lie on the host, and every chunk would transfer them again.
                 models = devices.put_everywhere(models, self._workers.mesh)
                 call = _Call(key, models, played, episodes, self._found.metrics)

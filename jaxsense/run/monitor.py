@@ -1,16 +1,18 @@
 """Reports of running stages: time, progress, metrics and failures."""
 
+import contextlib
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxsense.run.clock import Clock
+from jaxsense.summary.blocks import StageTiming, Timing
 
 T = TypeVar("T")
 
@@ -32,29 +34,56 @@ def is_finite(values: PyTree) -> bool:
     return all(np.isfinite(leaf).all() for leaf in leaves)
 
 
-class Monitor:
-    """The clock and the listener that the stages of a run share.
+class Stopwatch:
+    """Measures the seconds of a run, and of each of its stages in all threads."""
 
-    Attributes:
-      clock: records when they did what.
-    """
+    def __init__(self):
+        """Starts now."""
+        self._lock = threading.Lock()
+        self.restart()
+
+    def restart(self) -> None:
+        """Starts again for another run."""
+        self._begin, self._stages = time.perf_counter(), dict[str, StageTiming]()
+
+    @contextlib.contextmanager
+    def measure(self, kind: Literal["compile_s", "run_s"], stage: str) -> Iterator[None]:
+        """Adds the seconds of a block to those of a stage."""
+        begin = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - begin
+        with self._lock:
+            self._stages.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})[kind] += seconds
+
+    def timing(self, number: int) -> Timing:
+        """The time since the start, divided equally among a number of concurrent runs."""
+        with self._lock:
+            stages: dict[str, StageTiming] = {
+                name: {"compile_s": each["compile_s"] / number, "run_s": each["run_s"] / number}
+                for name, each in self._stages.items()
+            }
+        return {"total_s": (time.perf_counter() - self._begin) / number, "stages": stages}
+
+
+class Monitor:
+    """The stopwatch and the listener that the stages of a run share."""
 
     def __init__(
         self,
         listener: Listener = lambda stage, done, total, metrics: None,
         warn: Callable[[str], None] = lambda text: None,
-        clock: Clock | None = None,
+        stopwatch: Stopwatch | None = None,
     ):
         """Begins a run.
 
         Args:
           listener: receives progress.
           warn: receives a line about a failure that does not end the run.
-          clock: of the run; a new one by default.
+          stopwatch: of the run; a new one by default.
         """
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self.warn, self.clock = warn, clock or Clock()
+        self.warn, self.stopwatch = warn, stopwatch or Stopwatch()
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
@@ -63,8 +92,8 @@ class Monitor:
         self._one_listener = listener
 
     def beside(self, listener: Listener) -> "Monitor":
-        """Returns a monitor for a concurrent run that shares this one's clock and stop flag."""
-        other = Monitor(listener, self.warn, self.clock)
+        """Returns a monitor for a concurrent run that shares this one's stopwatch and stop flag."""
+        other = Monitor(listener, self.warn, self.stopwatch)
         other._stop = self._stop
         return other
 

@@ -121,13 +121,12 @@ def learn(
       StageError, Stopped, OSError: see `loop.train`.
     """
     trained = train(key, config, programs, monitor, checkpoints)
-    with monitor.clock.record("wait_program", "mission"):
-        scenario = monitor.wait_for(programs.player).mission
+    scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     beliefs = summary.beliefs(trained.outputs["beliefs"])
     is_sound = compare.unsound(beliefs) is None
-    learned = Learned(
+    return Learned(
         models=models(trained.outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
@@ -151,8 +150,6 @@ def learn(
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
         },
     )
-    monitor.clock.add_rest("summarise")
-    return learned
 
 
 def play(
@@ -179,13 +176,10 @@ def play(
     player, episodes = programs.player.result(), config.mission.episodes
     cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
-    monitor.clock.add_rest("start")
     found = player.play(mission_key(key), learned.models, played, episodes)
     (checkpoints or Checkpoints()).forget_unfinished()
     block = summary.missions(player.mission, found.metrics)
-    results = Played(found.recording, found.naive, block)
-    monitor.clock.add_rest("summarise")
-    return results
+    return Played(found.recording, found.naive, block)
 
 
 def _grouped(trained: Trained) -> dict[str, object]:

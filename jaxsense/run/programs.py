@@ -202,7 +202,7 @@ def _trace(programs: Programs, compiler: Compiler) -> None:
 
 
 def _trace_missions(programs: Programs, compiler: Compiler) -> None:
-    with compiler.monitor.clock.record("trace", "mission"):
+    with compiler.monitor.stopwatch.measure("compile_s", "mission"):
         scenario = mission.make_mission(programs.config, programs.policies)
     batch, workers = _batch(programs), programs.workers
     runs_long = batches.runs_long(programs.config, _num_missions(programs.config))

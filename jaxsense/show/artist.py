@@ -5,8 +5,6 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TypeAlias
 
-from jaxsense.run.clock import Clock
-
 Pictures: TypeAlias = Mapping[str, bytes | str]
 """The content of plots and films, by the names of their files."""
 
@@ -14,13 +12,8 @@ Pictures: TypeAlias = Mapping[str, bytes | str]
 class Artist:
     """Draws in one thread of its own, because matplotlib does not work in several at once."""
 
-    def __init__(self, clock: Clock):
-        """Begins without pictures.
-
-        Args:
-          clock: records how long drawing takes.
-        """
-        self._clock = clock
+    def __init__(self):
+        """Begins without pictures."""
         self._thread = ThreadPoolExecutor(1, "draw")
         self._drawn: list[tuple[Path, Future[Pictures]]] = []
 
@@ -38,20 +31,14 @@ class Artist:
           path: where they belong.
           draw: returns them.
         """
-
-        def record() -> Pictures:
-            with self._clock.record("draw", "report"):
-                return draw()
-
-        self._drawn.append((path, self._thread.submit(record)))
+        self._drawn.append((path, self._thread.submit(draw)))
 
     def finished(self) -> dict[Path, Pictures]:
         """Waits for all pictures; returns them by where they belong, or raises what failed."""
         futures = [future for _, future in self._drawn]
-        with self._clock.record("wait_drawing"):
-            # A wait without timeout may not notice Ctrl-C.
-            while wait(futures, timeout=0.2).not_done:
-                pass
+        # A wait without timeout may not notice Ctrl-C.
+        while wait(futures, timeout=0.2).not_done:
+            pass
         found: dict[Path, Pictures] = {}
         for path, future in self._drawn:
             found[path] = {**found.get(path, {}), **future.result()}

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxsense.config import ArenaConfig
-from jaxsense.summary.profile import Kind
 
 RGB = tuple[float, float, float]
 MARKERS = "oDs^vPX<>pd"
@@ -27,16 +26,6 @@ _POLICY_COLOURS = {
 _OTHER_POLICY = ("#0fb851", "#0cc75f"), "*"  # a custom one
 ON_DARK = dict([*_POLICY_COLOURS.values(), _OTHER_POLICY[0]])
 """Counterparts of the colours of policies on a dark page, where they must differ as well."""
-_OWN = "starting, summing up", "0.45"
-_TRACING = "tracing, lowering", "#d9a400"
-_FILES = "reading, saving", "#7d8a12"
-ACTIVITIES: dict[Kind, tuple[str, str]] = {
-    "import": _OWN, "start": _OWN, "summarise": _OWN, "trace": _TRACING, "lower": _TRACING,
-    "compile": ("compiling", "#c8443c"), "load": ("loading", "#8250c8"),
-    "wait_program": ("waiting for a program", "0.7"), "run": ("running", "#1558b0"),
-    "read": _FILES, "save": _FILES, "draw": ("drawing", "#0891a8"),
-}  # fmt: skip
-"""Name and colour of what a run does; the others are not drawn."""
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _TOGETHER = 0.05  # latent distance of classes that a picture cannot separate
 _DARKEST, _LIGHTEST = -0.75, 0.6

@@ -10,9 +10,8 @@ from pathlib import Path
 from jaxsense.config import PRESETS, Config, as_plain, parse_json
 from jaxsense.show import html, tables
 from jaxsense.show.mission_plots import counted
-from jaxsense.summary import Evaluation, Missions, Summary, cases, compare, profile
+from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
 from jaxsense.summary.metrics import mean
-from jaxsense.summary.profile import Span
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")
@@ -24,7 +23,6 @@ def render(
     config: Config,
     summary: Summary,
     evaluations: Mapping[str, Evaluation] | None = None,
-    spans: Sequence[Span] = (),
 ) -> str:
     """Writes the page of a run, or of several seeds, as text.
 
@@ -33,7 +31,6 @@ def render(
       config: its settings.
       summary: its summary.
       evaluations: further missions, by the names of their files.
-      spans: when the run did what, if it is known.
 
     Raises:
       OSError: if a picture cannot be read.
@@ -60,7 +57,6 @@ def render(
         ],
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
-        profile=profile.verdict(spans),
         devices=_counted(summary["devices"]),
         commit=_commit(run),
         changed=_changed(config, summary["preset"]),

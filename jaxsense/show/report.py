@@ -2,12 +2,11 @@
 
 from jaxsense.config import Config
 from jaxsense.run import files
-from jaxsense.run.clock import Clock
 from jaxsense.run.pipeline import Learned, Played
 from jaxsense.run.rundir import RunDirectory
-from jaxsense.show import animation, drawing, page, plots, timeline
+from jaxsense.show import animation, page, plots
 from jaxsense.show.artist import Pictures
-from jaxsense.summary import Results, Summary, profile
+from jaxsense.summary import Results, Summary
 
 
 def of_training(config: Config, learned: Learned) -> Pictures:
@@ -57,30 +56,17 @@ def of_seeds(config: Config, curves: plots.Curves, results: Results) -> Pictures
     return {**plots.of_learning(curves, results), **missions}
 
 
-def write(
-    run: RunDirectory, pictures: Pictures, found: Summary, clock: Clock | None = None
-) -> None:
-    """Writes pictures, the page that shows them, and `timing.json`.
+def write(run: RunDirectory, pictures: Pictures, found: Summary) -> None:
+    """Writes pictures and the page that shows them.
 
     Args:
       run: its directory.
       pictures: of the run.
       found: its summary.
-      clock: of the run; none with several seeds, of which each has a chart of its own.
 
     Raises:
       OSError: if a file cannot be written.
     """
-    clock, has_chart = clock or Clock(), clock is not None
-    with clock.record("save", "report"):
-        for name, content in pictures.items():
-            files.write(run.path / name, content)
-    spans = clock.spans if has_chart else []
-    with clock.record("draw", "report"):
-        if has_chart:
-            files.write(run.path / "timing.svg", drawing.svg(timeline.timeline(spans)))
-        rendered = page.render(run.path, run.settings.config, found, spans=spans)
-    with clock.record("save", "report"):
-        files.write(run.path / "report.html", rendered)
-    if has_chart:
-        files.write(run.path / profile.FILE, profile.as_text(clock.spans))
+    for name, content in pictures.items():
+        files.write(run.path / name, content)
+    files.write(run.path / "report.html", page.render(run.path, run.settings.config, found))

@@ -1,21 +1,14 @@
-"""Recorded scans: resampling, fitting the noise of a LiDAR, and inserting PoIs.
-
-`insert` and `random_view` can be traced; the other functions work on the host.
-"""
+"""Recorded scans: resampling, and fitting the noise of a LiDAR. All functions work on the host."""
 
 import dataclasses
-from collections.abc import Sequence
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxsense.config import Config, LidarConfig, Shape
+from jaxsense.config import LidarConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Key, pytree
-from jaxsense.sim import raycast, resampling
+from jaxsense.sim import resampling
 from jaxsense.sim.sensors import Sensor
 
 _BEAMS = 15  # of a piece of wall
@@ -207,141 +200,3 @@ def _edges(ranges: Float[np.ndarray, "S A"], max_range: float) -> tuple[float, f
     clean = np.sum(is_edge & ~is_mixed) / 2
     lost = np.sum(is_surface & np.isinf(middle)) / max(np.sum(is_surface), 1)
     return float(mixed / (np.sum(is_mixed) + clean)), float(lost)
-
-
-@pytree
-class Errors:
-    """Measured errors of a recorded LiDAR, for `insert` to apply to PoIs.
-
-    Attributes:
-      residuals: `[R, K]` of K neighbouring beams, in metres, see `wall_residuals`.
-      mixed_pixels: `[]` share of edges at which a beam measures a distance between both surfaces.
-    """
-
-    residuals: Float[Array, "R K"]
-    mixed_pixels: Float[Array, ""]
-
-
-def errors(
-    config: Config, angles: Float[np.ndarray, " A"], ranges: Float[np.ndarray, "S A"]
-) -> Errors:
-    """Measures the errors of recorded scans at surfaces up to twice as far as PoIs.
-
-    Args:
-      config: all settings.
-      angles: directions of the beams, in radians, in order.
-      ranges: `[S, A]` distances in metres, infinite or 0 without a return.
-
-    Raises:
-      ValueError: if the scans show too few straight walls or edges.
-    """
-    residuals, distances = wall_residuals(angles, ranges)
-    near = residuals[distances < 2 * config.viewpoint.max_distance]
-    mixed_pixels = fit_noise(config.lidar, angles, ranges).mixed_pixels
-    return Errors(jnp.asarray(near), jnp.float32(mixed_pixels))
-
-
-@pytree
-class Inserted:
-    """A recorded scan with an inserted PoI.
-
-    Attributes:
-      ranges: `[A]` distances, in metres.
-      bearing: `[]` believed bearing of the PoI, in radians.
-      distance: `[]` distance of its centre, in metres.
-      label: `[]` int32 index of its shape.
-      is_visible: `[]` whether there was room for it: nothing recorded hides or touches it.
-    """
-
-    ranges: Float[Array, " A"]
-    bearing: Float[Array, ""]
-    distance: Float[Array, ""]
-    label: Int[Array, ""]
-    is_visible: Bool[Array, ""]
-
-
-def random_view(
-    key: Key, config: Config, angles: Float[Array | np.ndarray, " A"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Draws a bearing around which a whole window was recorded, and a distance, for a PoI.
-
-    Args:
-      key: random key.
-      config: all settings.
-      angles: directions of the recorded beams, in radians, from right to left.
-
-    Returns:
-      The bearing, in radians, and the distance at which a PoI may be expected, in metres.
-    """
-    lidar, viewpoint = config.lidar, config.viewpoint
-    span = (lidar.window / 2 + 1) * lidar.stride / max(lidar.num_beams - 1, 1)
-    margin = jnp.radians(lidar.field_of_view * span + viewpoint.bearing_error)
-    draw = jax.random.uniform(key, (2,))
-    bearing = angles[0] + margin + (angles[-1] - angles[0] - 2 * margin) * draw[0]
-    near, far = viewpoint.min_distance, viewpoint.max_distance
-    return bearing, near + (far - near) * draw[1]
-
-
-def insert(
-    key: Key,
-    config: Config,
-    angles: Float[Array | np.ndarray, " A"],
-    ranges: Float[Array, " A"],
-    errors: Errors,
-) -> Inserted:
-    """Inserts a PoI of random shape, position and yaw into a recorded scan of a LiDAR.
-
-    Each beam measures what is nearer, the recorded surface or the PoI's. At the PoI it has
-    recorded errors: those of pieces of walls, and mixed pixels at the edges.
-
-    Args:
-      key: random key.
-      config: all settings, of which arena and viewpoint say what PoIs are and where.
-      angles: directions of the beams, in radians, from right to left.
-      ranges: `[A]` recorded distances, in metres, infinite without a return.
-      errors: of the scanner.
-    """
-    view_key, place_key, piece_key, mixed_key = jax.random.split(key, 4)
-    arena, viewpoint, residuals = config.arena, config.viewpoint, errors.residuals
-    bearing, distance = random_view(view_key, config, angles)
-    draw = jax.random.uniform(place_key, (3,))
-    shapes = [arena.shapes[name] for name in arena.labels("shape")]
-    label = jnp.floor(draw[0] * len(shapes)).astype(jnp.int32)
-    centre = distance * jnp.stack([jnp.cos(bearing), jnp.sin(bearing)])
-    yaw = 2 * jnp.pi * draw[1]
-    hit = _hits(shapes, arena.poi_radius, centre, yaw, jnp.asarray(angles))[label]
-
-    half_width = jnp.arcsin(jnp.minimum(arena.poi_extent / distance, 1.0))
-    is_free = ranges > distance + arena.poi_extent
-    is_visible = jnp.all(is_free | (jnp.abs(angles - bearing) > half_width))
-    number = -(-len(angles) // residuals.shape[1])
-    pieces = jax.random.randint(piece_key, (number,), 0, len(residuals))
-    met = jnp.minimum(ranges, hit + residuals[pieces].reshape(-1)[: len(angles)])
-
-    is_on, following = hit < ranges, jnp.append(met[1:], met[-1:])
-    uniform = jax.random.uniform(mixed_key, (2, len(angles)))
-    is_edge = is_on != jnp.append(is_on[1:], is_on[-1:])
-    # Nothing lies between a surface and nothing.
-    is_edge &= jnp.isfinite(met) & jnp.isfinite(following)
-    between = met + uniform[1] * jnp.where(is_edge, following - met, 0.0)
-    measured = jnp.where(is_edge & (uniform[0] < errors.mixed_pixels), between, met)
-    believed = bearing + jnp.radians(viewpoint.bearing_error) * (2 * draw[2] - 1)
-    return Inserted(measured, believed, distance, label, is_visible)
-
-
-def _hits(
-    shapes: Sequence[Shape],
-    radius: float,
-    centre: Float[Array, "2"],
-    yaw: Float[Array, ""],
-    angles: Float[Array, " A"],
-) -> Float[Array, "L A"]:
-    """Distance of each beam to a solid of each shape, infinite where it misses."""
-    axis = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])[None]
-
-    def of(shape: Shape) -> jax.Array:
-        half = radius * jnp.array(shape.half_sides)[None]
-        section = raycast.CrossSection(centre[None], axis, half, (0,), shape.is_round)
-        return raycast.cast(section, np.zeros(2), angles).distance
-
-    return jnp.stack([of(shape) for shape in shapes])

@@ -27,7 +27,8 @@ class Timing(TypedDict):
     """`timing`."""
 
     total_s: Annotated[
-        float, Metric("total time [s]", "Duration of the whole command; stages overlap.", 1)
+        float,
+        Metric("total time [s]", "Duration of the command after its imports; stages overlap.", 1),
     ]
     stages: dict[str, StageTiming]
 

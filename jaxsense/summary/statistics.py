@@ -5,29 +5,9 @@ from typing import cast
 
 import numpy as np
 
-from jaxsense.summary.blocks import Results, StageTiming, Summary, Timing
+from jaxsense.summary.blocks import Results, Summary, Timing
 from jaxsense.summary.compare import interval
 from jaxsense.summary.read import RESULTS
-
-
-def timing(total: float, stages: dict[str, StageTiming], number: int) -> Timing:
-    """Divides the time of concurrent runs equally among them.
-
-    Args:
-      total: seconds of all runs together.
-      stages: seconds of each stage, `compile_s` and `run_s`.
-      number: of runs.
-
-    Returns:
-      The block `timing` of each.
-    """
-    return {
-        "total_s": total / number,
-        "stages": {
-            name: {"compile_s": stage["compile_s"] / number, "run_s": stage["run_s"] / number}
-            for name, stage in stages.items()
-        },
-    }
 
 
 def of_seeds(runs: Sequence[Summary]) -> tuple[Timing, dict[str, Results], Results]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import exported, gate, imperfect, pipeline, recorded, results, studies
+from benchmarks import exported, gate, imperfect, pipeline, results, studies
 from benchmarks.results import PAGES, TABLES
 from jaxsense.config import options
 
@@ -21,7 +21,6 @@ ORIGIN = {
         (gate, "pretrained:default 'runs/my run' --looks 2000 --search-position 0.09"),
         (imperfect, "pretrained:noisy --episodes 8 --positions --headings --losses 0.5 0.9"),
         (exported, "runs/a --states 5 --trust"),
-        (recorded, "latest"),
         (pipeline, "ce31224 --commands cold warm"),
     ],
 )
@@ -79,12 +78,6 @@ def test_programs_are_shown_with_their_latencies():
     assert "merge" not in table
     latencies = exported.latencies(found, ["pretrained:noisy"], ["decide"])
     assert latencies.splitlines()[::2][:2] == ["| program | `noisy` |", "| `decide` | 3,200 µs |"]
-
-
-def test_real_scans_are_shown_with_their_noise():
-    found = {**ORIGIN, "shares": {"PoI: passes": 0.99}, "noise": {"dropout": 0.000241}}
-    assert "| PoI: passes | 0.9900 |" in recorded.table(found)
-    assert "| `lidar.dropout` | 0.00024 |" in recorded.of_noise(found)
 
 
 def test_every_table_of_a_page_has_a_function():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsense
-from benchmarks import curves, gate, imperfect, lost_beams, place, recorded, results, where
+from benchmarks import curves, gate, imperfect, lost_beams, place, results, where
 from benchmarks.curves import Curves
 
 FIGURES = ("accuracy", "confidence", "looks", "time", "own", "nll", "collisions")
@@ -33,7 +33,6 @@ def _played(monkeypatch):
     monkeypatch.setattr(gate, "answered", lambda *_: shares)
     monkeypatch.setattr(place, "accuracies", lambda *_: {"camera": 0.9, "lidar": 0.8})
     monkeypatch.setattr(place, "seconds_at", lambda *_: [1.0, 2.0, 3.0])
-    monkeypatch.setattr(recorded, "figures", lambda *_: {"PoI: passes": 0.5})
 
 
 @pytest.mark.usefixtures("_played")
@@ -63,18 +62,6 @@ def test_a_program_prints_the_tables_of_its_file(program, file, options, tmp_pat
     with pytest.raises(SystemExit):
         program.main([*options, "--json", str(path)])
     assert "already exists" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("_played")
-@pytest.mark.skipif(not recorded.rawlog.DIRECTORY.exists(), reason="mrpt-common is not installed")
-def test_real_scans_go_into_a_file(tmp_path, capsys):
-    path = tmp_path / "recorded.json"
-    recorded.main(["pretrained:default", "--json", str(path)])
-    content = json.loads(path.read_text(encoding="utf-8"))
-    assert content["scans"] == 704
-    assert content["noise"]["range_noise"] == pytest.approx(0.0048, abs=1e-4)
-    printed = capsys.readouterr().out
-    assert all(table(content) in printed for table in results.TABLES[path.name].values())
 
 
 @pytest.mark.parametrize("way", lost_beams.WAYS)

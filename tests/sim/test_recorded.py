@@ -1,4 +1,4 @@
-"""Recorded scans: other rays, the noise of a LiDAR, and PoIs that are cast in."""
+"""Recorded scans: other rays, and the noise of a LiDAR."""
 
 from dataclasses import replace
 
@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import PRESETS, CameraConfig, LidarConfig
+from jaxsense.config import CameraConfig, LidarConfig
 from jaxsense.sim import disturbances, raycast, recorded, resampling, sensors
 
 LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
 CAMERA = sensors.camera(CameraConfig(num_pixels=8, window=3, stride=1))
-CONFIG = PRESETS["default"]
 ANGLES = np.radians(np.linspace(-90, 90, 361)).astype(np.float32)
 
 
@@ -245,80 +244,6 @@ def test_too_few_scans_to_fit_the_noise_to_are_named():
     expected = "pieces of walls, 20 or more of them in 1 bins"
     with pytest.raises(ValueError, match=expected):
         recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), 2.2, np.float32))
-
-
-def exact(mixed_pixels=0.0):
-    return recorded.Errors(jnp.zeros((1, 15)), jnp.float32(mixed_pixels))
-
-
-@jax.jit
-def insert_all(keys, ranges, errors):
-    return jax.vmap(lambda k: recorded.insert(k, CONFIG, ANGLES, ranges, errors))(keys)
-
-
-KEYS = jax.random.split(jax.random.key(1), 300)
-
-
-def test_a_poi_in_an_empty_scan_is_where_it_should_be():
-    found = insert_all(KEYS, jnp.full(361, jnp.inf), exact())
-    assert found.is_visible.all()
-    radius, is_cylinder = CONFIG.arena.poi_radius, np.asarray(found.label) == 0
-    assert 100 < is_cylinder.sum() < 200
-    # The nearest beam of a cylinder is a radius before its centre, that of a cube no farther.
-    depth = np.asarray(found.distance - found.ranges.min(axis=1))
-    np.testing.assert_allclose(depth[is_cylinder], radius, atol=2e-4)
-    assert (depth[~is_cylinder] > radius - 2e-4).all()
-    assert (depth[~is_cylinder] < np.sqrt(2) * radius).all()
-    # Half of a cylinder's width is arcsin(radius / distance), to either side of its bearing.
-    is_on = np.isfinite(found.ranges)
-    width = is_on.sum(axis=1) * np.radians(0.5)
-    expected = 2 * np.arcsin(radius / np.asarray(found.distance))
-    np.testing.assert_allclose(width[is_cylinder], expected[is_cylinder], atol=np.radians(0.6))
-    middle = np.array([ANGLES[on].mean() for on in is_on])
-    error = np.degrees(np.abs(middle - found.bearing)[is_cylinder])
-    assert 0.9 < error.max() < CONFIG.viewpoint.bearing_error + 0.3
-    assert found.distance.min() < 0.35
-    assert found.distance.max() > 1.15
-
-
-def test_what_is_recorded_hides_a_poi():
-    found = insert_all(KEYS, jnp.full(361, 0.9), exact())
-    has_room = np.asarray(found.distance) + CONFIG.arena.poi_extent < 0.9
-    np.testing.assert_array_equal(found.is_visible, has_room)
-    assert found.ranges.max() <= 0.9
-
-
-def test_a_poi_is_measured_with_recorded_errors():
-    errors = recorded.Errors(jnp.full((1, 15), 0.03), jnp.float32(0.0))
-    background = jnp.full(361, 4.0)
-    found, as_is = insert_all(KEYS, background, errors), insert_all(KEYS, background, exact())
-    off = np.where(np.asarray(as_is.ranges) < 4.0, 0.03, 0.0)
-    np.testing.assert_allclose(found.ranges - as_is.ranges, off, atol=1e-5)
-
-
-@pytest.mark.parametrize("share", [0.2, 1.0])
-def test_edges_of_a_poi_are_mixed(share):
-    found = insert_all(KEYS, jnp.full(361, 4.0), exact(share))
-    as_is = insert_all(KEYS, jnp.full(361, 4.0), exact())
-    changed = np.asarray(found.ranges != as_is.ranges).sum(axis=1)
-    assert changed.mean() == pytest.approx(2 * share, abs=0.15)
-    between = np.asarray(found.ranges)[np.asarray(found.ranges != as_is.ranges)]
-    assert between.mean() == pytest.approx((4.0 + 0.7) / 2, abs=0.25)
-    nowhere = insert_all(KEYS, jnp.full(361, jnp.inf), exact(share))
-    assert not np.isnan(nowhere.ranges).any()
-
-
-def test_views_show_a_whole_window():
-    sensor = sensors.lidar(CONFIG.lidar)
-    draw = jax.jit(jax.vmap(lambda key: recorded.random_view(key, CONFIG, ANGLES)))
-    bearings, distances = draw(jax.random.split(jax.random.key(2), 2000))
-    ends = np.degrees(np.asarray(bearings))
-    # 180 degrees, less the 65 beams of half a window to either side and an error of 1 degree.
-    limit = 90 - 65 * 240 / 682 - 1
-    np.testing.assert_allclose([ends.min(), ends.max()], [-limit, limit], atol=0.2)
-    assert 0.3 <= distances.min() < 0.31
-    assert 1.19 < distances.max() <= 1.2
-    assert sensor.window == 128
 
 
 def test_short_gaps_between_beams_are_closed():

@@ -18,10 +18,9 @@ def test_statistics_are_those_of_student():
     assert statistics.statistics([{"a": 3.0}]) == {"a": {"mean": 3.0, "low": None, "high": None}}
 
 
-def test_the_time_of_runs_side_by_side_is_shared_and_summed_up():
+def test_the_times_of_seeds_add_up():
     stages = {"jmvae": {"compile_s": 4.0, "run_s": 6.0}}
     half = {"total_s": 5.0, "stages": {"jmvae": {"compile_s": 2.0, "run_s": 3.0}}}
-    assert statistics.timing(10.0, stages, 2) == half
     blocks = {key: {"x": 1.0} for key in ("detectors", "jmvae", "belief", "dqn", "mission")}
     runs = [{"seed": seed, "timing": half, **blocks} for seed in (4, 5)]
     total, of_each, means = statistics.of_seeds(runs)
