@@ -1,6 +1,5 @@
 """`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
-import contextlib
 import dataclasses
 import functools
 import sys
@@ -18,12 +17,13 @@ from jaxsense.config import TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
-from jaxsense.run import batches, cli, devices, files, missions, rundir
+from jaxsense.run import batches, cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, drawing, mission_plots, page, tables
-from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare, profile
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS
@@ -137,8 +137,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
-    with contextlib.suppress(OSError):  # as in `say`
-        _print(console, block, arguments.episodes)
+    _print(console, block, arguments.episodes)
     say(
         f"{number} missions in {seconds:.1f} s after {compiled - begin:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "
@@ -263,11 +262,11 @@ def _print(console: rich.console.Console, missions: summary.Missions, episodes: 
     caption = f"{episodes} missions of each policy, in the same arenas"
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
-            print_table(console, table)
+            say(as_text(console, table))
     if verdict := compare.verdict(summary.cases(missions)):
         say(verdict)
     say(compare.detection_sizes(missions))
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

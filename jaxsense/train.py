@@ -21,18 +21,19 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir, seeds
 from jaxsense.run.clock import Clock, process_start
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
-from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare, profile, statistics
 from jaxsense.summary.blocks import Header
 
@@ -143,8 +144,7 @@ def main(
     if not is_first:
         return
     if not arguments.quiet:
-        with contextlib.suppress(OSError):  # as in `say`
-            _print_summary(console, run)
+        _print_summary(console, run)
     first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
@@ -277,10 +277,10 @@ def _train(
             again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
-            cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
+            output.complain(f"Stopped; all training so far is saved. To resume: {again}")
         # Other processes may be blocked in a collective; wait only briefly.
         processes.leave(processes.LEAVE_TIMEOUT)
-        sys.exit(cli.INTERRUPTED)
+        sys.exit(output.INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)
     # Another process has none of the seeds that were finished before.
@@ -386,7 +386,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     say(f"{settings.preset} preset, {which}, {found['timing']['total_s']:.0f} s in total")
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
-        print_table(console, table)
+        say(as_text(console, table))
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
     for remark in compare.remarks(settings.preset, found["belief"]):
@@ -394,4 +394,4 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

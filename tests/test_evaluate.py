@@ -164,15 +164,15 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
     program = """
 import os, sys
 from jaxsense import train
-from jaxsense.run import cli
+from jaxsense.run import output
 train._train = lambda clock, arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 resume = lambda: train.main(["--resume", sys.argv[2]])
-cli.run(resume)
+output.run(resume)
 sys.stdout.flush()
 os.unlink(os.path.join(sys.argv[2], "summary.json"))
 os.dup2(os.open("/dev/full", os.O_WRONLY), sys.stdout.fileno())
-cli.run(resume)
+output.run(resume)
 """
     command = [sys.executable, "-c", program, str(smoke_run / "summary.json"), str(path)]
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -18,6 +18,7 @@ from jaxtyping import PyTree
 
 from jaxsense.run import files
 from jaxsense.run.clock import Recorder
+from jaxsense.run.output import complain
 from jaxsense.run.version import versions
 
 Function: TypeAlias = Callable[..., PyTree]
@@ -69,7 +70,7 @@ class Kept:
         """Opens the cache, and removes the least recently used programs.
 
         Args:
-          directory: holds the traced programs, and JAX's compilation cache.
+          directory: holds the traced programs.
           *settings: everything outside jaxsense's source that programs close over, as values whose
             `repr` tells them apart.
 
@@ -77,8 +78,7 @@ class Kept:
           OSError: if the directory cannot be made, or if other users may write to it: loading a
             program runs it.
         """
-        use_cache(directory)
-        self.path = directory / "traced"
+        self.path, self._told = directory / "traced", set[str]()
         _make_private(self.path)
         self._depends = repr((settings, _SOURCE, _surroundings())).encode()
         # Another run may be removing some too.
@@ -108,21 +108,23 @@ class Kept:
           args: its arguments or their shapes.
 
         Returns:
-          The program; None if its file is missing or damaged.
+          The program; None if its file is missing or, with a line to standard error, damaged.
         """
-        # Tracing the program again repairs any file.
-        with contextlib.suppress(Exception):
-            path = self._file(name, args)
+        path = self._file(name, args)
+        try:
             with path.open("rb") as file:
                 if not _is_private(os.fstat(file.fileno()), 0o022):
-                    return None
+                    raise PermissionError("other users may have written it")
                 content = file.read()
             # A single wrong bit could end the process.
             structure, flat = pickle.loads(files.without_digest(content))
             found = Traced(export.deserialize(bytearray(flat)), structure)
             path.touch()
             return found
-        return None
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # tracing the program again repairs any file
+            return self._tell(error)
 
     def find_or_trace(
         self, name: str, function: Function, args: PyTree, record: Recorder
@@ -136,7 +138,8 @@ class Kept:
           record: what is recorded: "load", and if the program is new, "trace" and "lower".
 
         Returns:
-          The program; None if it cannot be exported.
+          The program; None if it cannot be exported. A line to standard error says why it cannot be
+          loaded, exported or cached.
         """
         with record("load"):
             found = self.find(name, args)
@@ -145,12 +148,21 @@ class Kept:
         # A run must not end because the next one will be slower: where a program calls something
         # that JAX cannot export, or on a full disk.
         traced = None
-        with contextlib.suppress(Exception):
+        try:
             traced = trace(function, args, record)
             with record("lower"):
                 content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
                 files.write_digested(self._file(name, args), content, mode=0o600)
+        except Exception as error:
+            self._tell(error)
         return traced
+
+    def _tell(self, error: Exception) -> None:
+        """Tells once why programs are slower to start than they could be."""
+        reason = " ".join(f"{type(error).__name__} {error}".splitlines()[:1])
+        if reason not in self._told:
+            self._told.add(reason)
+            complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
