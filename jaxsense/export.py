@@ -27,7 +27,7 @@ from jaxsense.interfaces.translate import arrays_of, program
 from jaxsense.mission.memory import MOST_LOOKS
 from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
-from jaxsense.run import cli, files, output, rundir
+from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import resampling, sensors
 from jaxsense.sim.sensors import Sensor
@@ -179,6 +179,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out
     try:
+        devices.start(1)
         config, models, by_default = load(arguments.run, arguments.trust)
         path = path or by_default
         with files.new(path) as file:

@@ -7,7 +7,8 @@ import numpy as np
 import rich.console
 
 from jaxsense import tasks
-from jaxsense.run import cli, output
+from jaxsense.config import ConfigError
+from jaxsense.run import cli, devices, output
 from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
 from jaxsense.show.terminal import as_text
@@ -30,6 +31,10 @@ def main(argv: list[str] | None = None) -> None:
       argv: the command line without the program; by default the process's own.
     """
     cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    try:
+        devices.start(1)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
     found = [tasks.make(name, agent) for name in tasks.registered() for agent in tasks.agents(name)]
     tell(as_text(rich.console.Console(), _table(found)))
     for name in tasks.registered():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
 from jaxsense.mission.memory import Memory
@@ -262,6 +263,7 @@ def make_mission(
     Raises:
       ValueError: if `arenas` were compiled from other settings than `config.arena`.
     """
+    checks.require_type("config", config, Config, "all settings")
     arena, free = (None, None) if arenas is None else arenas
     return Mission(
         world=worlds.make_world(config, config.carried, arena=arena, contacts=contacts),

@@ -278,6 +278,8 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         checkpoint, if the run names custom sensors without trust, or if JAX computes in 64 bits.
     """
     require_32_bits()
+    if not isinstance(path, str | Path):
+        raise ConfigError("run", path, "must be a path")
     path, given = Path(path), str(path)
     if given.startswith(PREFIX) and not path.exists():
         return load_pretrained(given.removeprefix(PREFIX))
