@@ -170,12 +170,13 @@ def _write(
         case["seed"] = arguments.seed
     path = run / EVALUATIONS / f"{place}-seed-{arguments.seed}-{arguments.episodes}-missions.json"
     with files.locked(run, on_wait=say):
-        # Another policy may have played in the same arenas before.
-        before = summary.read_evaluations(run).get(path.stem)
-        blocks = {**(before["mission"] if before else {}), **missions}
-        found = _evaluation(config, compare.compared(blocks))
-        if not before or _is_alike(before.get("origin"), rundir.origin()):
-            found["origin"] = rundir.origin()
+        # Another policy may have played in the same arenas before; by other code, it stands apart.
+        others = summary.read_evaluations(run)
+        names = [path.stem, *(f"{path.stem}-{n + 2}" for n in range(len(others)))]
+        name = next(name for name in names if name not in others or _is_alike(others[name]))
+        path = path.with_name(f"{name}.json")
+        blocks = {**(others[name]["mission"] if name in others else {}), **missions}
+        found = _evaluation(config, compare.compared(blocks), rundir.origin())
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
@@ -188,27 +189,31 @@ def _write(
 def _report(run: Path, config: Config) -> Path:
     """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
     own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
-    places = [_evaluation(config, own["mission"]), *found.values()]
+    made = [_evaluation(config, own["mission"], own), *found.values()]
+    places = [each for each in made if _is_alike(each)]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
         files.write(run / "teams.svg", drawing.svg(mission_plots.teams(places)))
     files.write(path, page.render(run, config, own, found, profile.read(run)))
     return path
 
 
-def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluation:
-    """Missions with their arena and team."""
+def _evaluation(
+    config: Config, missions: summary.Missions, origin: summary.Origin
+) -> summary.Evaluation:
+    """Missions with their arena, their team and what made them."""
     arena = config.arena
     return {
         "num_pois": arena.num_pois,
         "side": arena.side,
         "robots": list(config.carried),
+        "origin": origin,
         "mission": missions,
     }
 
 
-def _is_alike(origin: summary.Origin | None, other: summary.Origin) -> bool:
-    """Whether figures of both are made alike, be it on other days."""
-    return origin is not None and {**origin, "date": None} == {**other, "date": None}
+def _is_alike(found: summary.Evaluation) -> bool:
+    """Whether missions were made as this process makes them, be it on another day."""
+    return not compare.differences_of([found.get("origin", compare.UNKNOWN), rundir.origin()])
 
 
 def _place(config: Config) -> str:

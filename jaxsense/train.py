@@ -303,6 +303,9 @@ def _train_together(
             records.append(tensorboard.make_writer(run.path / "tensorboard"))
         return Display(console, records, quiet=arguments.quiet or run is not runs[0])
 
+    for run in runs:
+        if several := compare.several_origins(run.made("mission")):
+            _warn(f"{run.path}: {several}")
     displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
     clock, artist = monitor.clock, Artist(monitor.clock)
@@ -336,7 +339,8 @@ def _train_together(
                 _warn(f"{result}; earlier checkpoints are in {run.path}")
                 continue
             monitor.check_stop()
-            found: summary.Summary = {**_header(run), "timing": timing, **result}
+            header = _header(run, run.made("mission"))
+            found: summary.Summary = {**header, "timing": timing, **result}
             _report().write(run, drawn[run.path], found, clock)
             monitor.check_stop()
             # Last, for it marks the run as finished.
@@ -347,8 +351,10 @@ def _train_together(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
-    timing, of_each, means = statistics.of_seeds([summary.read(path) for path in paths])
-    found: summary.Summary = {**_header(run), "timing": timing, "seeds": of_each, **means}
+    summaries = [summary.read(path) for path in paths]
+    timing, of_each, means = statistics.of_seeds(summaries)
+    header = _header(run, [*statistics.made(summaries), *run.made("means")])
+    found: summary.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
@@ -368,13 +374,14 @@ def _warn(text: str) -> None:
     cli.warn(PROGRAM, text)
 
 
-def _header(run: RunDirectory) -> Header:
-    """A summary's keys about the run itself."""
-    return {
+def _header(run: RunDirectory, made: list[summary.Made]) -> Header:
+    """A summary's keys about the run itself, with what made its stages if that differs."""
+    found: Header = {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
         **rundir.origin(),
     }
+    return {**found, "origins": made} if compare.differences_of(made) else found
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
@@ -389,7 +396,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
         say(as_text(console, table))
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
-    for remark in compare.remarks(settings.preset, found["belief"]):
+    for remark in compare.remarks(found):
         say(remark)
 
 

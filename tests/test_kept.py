@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, files
+from jaxsense.run import cli, files, version
 from jaxsense.run import kept as kept_programs
 from jaxsense.run.clock import Clock
 from jaxsense.run.compilation import Compiler, Program
@@ -323,16 +324,27 @@ def test_another_source_or_processor_is_another_program(tmp_path, monkeypatch):
         assert not is_there()
     processor.write_text("model name : Abacus\nflags : add\n")
     assert is_there()
-    (name, digest), *others = kept_programs._SOURCE
-    monkeypatch.setattr(kept_programs, "_SOURCE", [(name, digest[::-1]), *others])
+    monkeypatch.setattr(version, "SOURCE", version.SOURCE[::-1])
     assert not is_there()
 
 
-def test_the_source_is_that_of_the_whole_package():
-    names = {name for name, _ in kept_programs._SOURCE}
-    assert {"kept.py", "detectors.py", "__init__.py", "cli.py"} <= names
+def test_the_source_is_that_of_the_whole_package(tmp_path):
     root = Path(jaxsense.__file__).parent
-    assert len(kept_programs._SOURCE) == len(list(root.rglob("*.py")))
+    shutil.copytree(root, tmp_path / "jaxsense", ignore=shutil.ignore_patterns("*.pyc"))
+    code = "from jaxsense.run import version; print(version.__file__, version.SOURCE)"
+
+    def told():
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-c", code]
+        found = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True)
+        file, source = found.split()
+        assert file == str(tmp_path / "jaxsense" / "run" / "version.py")
+        return source
+
+    assert told() == version.SOURCE
+    with (tmp_path / "jaxsense" / "vae" / "gaussian.py").open("a", encoding="utf-8") as file:
+        file.write("\n")
+    assert told() != version.SOURCE
 
 
 def test_programs_of_custom_sensors_are_not_kept(tmp_path):

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 import os
 import pickle
-import platform
 import re
 import stat
 import warnings
@@ -16,22 +15,16 @@ import jax
 from jax import export
 from jaxtyping import PyTree
 
-from jaxsense.run import files
+from jaxsense.run import files, version
 from jaxsense.run.clock import Recorder
 from jaxsense.run.output import complain
-from jaxsense.run.version import versions
 
 Function: TypeAlias = Callable[..., PyTree]
 
-# Read at import, so that it matches the code that runs.
-_SOURCE = [
-    (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py"))
-]
 _MAX_KEPT = 512  # traced programs; a run has about twenty
 _MAX_BYTES = 2**31  # of compiled programs
-_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
 _CPU_INFO = Path("/proc/cpuinfo")
+_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
 
 
 class Traced(NamedTuple):
@@ -80,7 +73,7 @@ class Kept:
         """
         self.path, self._told = directory / "traced", set[str]()
         _make_private(self.path)
-        self._depends = repr((settings, _SOURCE, _surroundings())).encode()
+        self._depends = repr((settings, _surroundings())).encode()
         # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
@@ -247,13 +240,13 @@ def _surroundings() -> list[object]:
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
     variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
     return [
-        versions(),
+        version.SOURCE,
+        version.versions(),
         sorted((name, value) for name, value in variables if not _sets_cache(name)),
         sorted((name, str(x)) for name, x in jax.config.values.items() if not _sets_cache(name)),
         jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
         sorted(features),
-        platform.python_version(),
     ]
 
 
