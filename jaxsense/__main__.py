@@ -4,6 +4,7 @@ import importlib
 import sys
 from typing import NoReturn
 
+from jaxsense.run import output
 from jaxsense.run.version import __version__
 
 COMMANDS = {
@@ -17,12 +18,17 @@ COMMANDS = {
 
 
 def main() -> None:
+    """Runs the command that the process's command line names, and ends the process."""
+    output.run(run)
+
+
+def run() -> None:
     """Runs the command that the process's command line names."""
     match sys.argv[1:]:
         case [] | ["-h" | "--help", *_]:
-            print(_help())
+            output.tell(_help())
         case ["--version", *_]:
-            print(f"jaxsense {__version__}")
+            output.tell(f"jaxsense {__version__}")
         case [name, *_] if name in COMMANDS:
             _run(name)
         case [name, *_]:
@@ -31,12 +37,9 @@ def main() -> None:
 
 def _run(name: str) -> None:
     """Runs a command, which reads the rest of the command line."""
-    # Here: JAX takes seconds to import.
-    from jaxsense.run import cli  # noqa: PLC0415
-
     del sys.argv[1]
     module, _ = COMMANDS[name]
-    cli.run(importlib.import_module(module).main)
+    importlib.import_module(module).main()
 
 
 def _help() -> str:
@@ -51,7 +54,7 @@ def _help() -> str:
 def _fail(name: str) -> NoReturn:
     """Ends the process with one line about a command that does not exist."""
     known = ", ".join(COMMANDS)
-    print(f"jaxsense: command = {name[:80]!r}: must be one of {known}", file=sys.stderr)
+    output.complain(f"jaxsense: command = {name[:80]!r}: must be one of {known}")
     sys.exit(2)
 
 

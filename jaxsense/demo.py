@@ -1,8 +1,6 @@
 """`jaxsense demo`: plays a mission with trained robots and opens a page with its animations."""
 
-import contextlib
 import dataclasses
-import gc
 import os
 import sys
 import webbrowser
@@ -16,12 +14,13 @@ from jaxsense.config import ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import command
 from jaxsense.models import Models
-from jaxsense.run import cli, devices, files, missions, rundir
+from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.missions import Played
 from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.output import say
 from jaxsense.show import animation, html, tables
-from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.show.terminal import Display, as_text
 from jaxsense.tasks import PRETRAINED, load_pretrained
 
 PROGRAM = "jaxsense.demo"
@@ -62,8 +61,6 @@ def main(argv: list[str] | None = None) -> None:
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     console = rich.console.Console()
-    # Tracing makes and drops millions of objects, and each collection looks through all that lives.
-    gc.disable()
     try:
         devices.start(1)
         config, models = load_pretrained(arguments.preset)
@@ -84,8 +81,7 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"{cli.reason(error)}")
-    with contextlib.suppress(OSError):  # as in `say`
-        print_table(console, table)
+    say(as_text(console, table))
     say(f"This is one mission of many; averages: README, {_AVERAGES}.")
     say(f"The page is {path}.")
     say(f"Next: {command('jaxsense tasks')}")
@@ -158,4 +154,4 @@ def _has_display() -> bool:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

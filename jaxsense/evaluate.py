@@ -1,6 +1,5 @@
 """`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
-import contextlib
 import dataclasses
 import functools
 import sys
@@ -18,12 +17,13 @@ from jaxsense.config import TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
-from jaxsense.run import batches, cli, devices, files, missions, rundir
+from jaxsense.run import batches, cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.show import animation, drawing, mission_plots, page, tables
-from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS
@@ -137,8 +137,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
     rate = found.control_steps / seconds
-    with contextlib.suppress(OSError):  # as in `say`
-        _print(console, block, arguments.episodes)
+    _print(console, block, arguments.episodes)
     say(
         f"{number} missions in {seconds:.1f} s after {compiled - begin:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "
@@ -171,12 +170,13 @@ def _write(
         case["seed"] = arguments.seed
     path = run / EVALUATIONS / f"{place}-seed-{arguments.seed}-{arguments.episodes}-missions.json"
     with files.locked(run, on_wait=say):
-        # Another policy may have played in the same arenas before.
-        before = summary.read_evaluations(run).get(path.stem)
-        blocks = {**(before["mission"] if before else {}), **missions}
-        found = _evaluation(config, compare.compared(blocks))
-        if not before or _is_alike(before.get("origin"), rundir.origin()):
-            found["origin"] = rundir.origin()
+        # Another policy may have played in the same arenas before; by other code, it stands apart.
+        others = summary.read_evaluations(run)
+        names = [path.stem, *(f"{path.stem}-{n + 2}" for n in range(len(others)))]
+        name = next(name for name in names if name not in others or _is_alike(others[name]))
+        path = path.with_name(f"{name}.json")
+        blocks = {**(others[name]["mission"] if name in others else {}), **missions}
+        found = _evaluation(config, compare.compared(blocks), rundir.origin())
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
@@ -189,27 +189,31 @@ def _write(
 def _report(run: Path, config: Config) -> Path:
     """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
     own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
-    places = [_evaluation(config, own["mission"]), *found.values()]
+    made = [_evaluation(config, own["mission"], own), *found.values()]
+    places = [each for each in made if _is_alike(each)]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
         files.write(run / "teams.svg", drawing.svg(mission_plots.teams(places)))
     files.write(path, page.render(run, config, own, found))
     return path
 
 
-def _evaluation(config: Config, missions: summary.Missions) -> summary.Evaluation:
-    """Missions with their arena and team."""
+def _evaluation(
+    config: Config, missions: summary.Missions, origin: summary.Origin
+) -> summary.Evaluation:
+    """Missions with their arena, their team and what made them."""
     arena = config.arena
     return {
         "num_pois": arena.num_pois,
         "side": arena.side,
         "robots": list(config.carried),
+        "origin": origin,
         "mission": missions,
     }
 
 
-def _is_alike(origin: summary.Origin | None, other: summary.Origin) -> bool:
-    """Whether figures of both are made alike, be it on other days."""
-    return origin is not None and {**origin, "date": None} == {**other, "date": None}
+def _is_alike(found: summary.Evaluation) -> bool:
+    """Whether missions were made as this process makes them, be it on another day."""
+    return not compare.differences_of([found.get("origin", compare.UNKNOWN), rundir.origin()])
 
 
 def _place(config: Config) -> str:
@@ -263,11 +267,11 @@ def _print(console: rich.console.Console, missions: summary.Missions, episodes: 
     caption = f"{episodes} missions of each policy, in the same arenas"
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
-            print_table(console, table)
+            say(as_text(console, table))
     if verdict := compare.verdict(summary.cases(missions)):
         say(verdict)
     say(compare.detection_sizes(missions))
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

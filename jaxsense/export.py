@@ -27,7 +27,7 @@ from jaxsense.interfaces.translate import arrays_of, program
 from jaxsense.mission.memory import MOST_LOOKS
 from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
-from jaxsense.run import cli, files, rundir
+from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import resampling, sensors
 from jaxsense.sim.sensors import Sensor
@@ -179,6 +179,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     path = arguments.out
     try:
+        devices.start(1)
         config, models, by_default = load(arguments.run, arguments.trust)
         path = path or by_default
         with files.new(path) as file:
@@ -189,8 +190,8 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({error.strerror or error})")
-    print(f"{path}: {len(content) / 1e3:.0f} kB, for NumPy and ONNX")
+    output.say(f"{path}: {len(content) / 1e3:.0f} kB, for NumPy and ONNX")
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

@@ -148,8 +148,10 @@ def require_fitting(config: Config, models: Models) -> None:
       models: the models.
 
     Raises:
-      ValueError: if they are for other classes, or their fusion is no `Fusion`.
+      ValueError: if one is of another type, they are for other classes, or their fusion is no
+        `Fusion`.
     """
+    checks.require_type("config", config, Config, "all settings")
     if not isinstance(models, Models):
         raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
     checks.require_members("models.fusion", models.fusion, Fusion)
@@ -168,6 +170,7 @@ def require_fitting(config: Config, models: Models) -> None:
 @checks.typed
 def make_jmvae(config: Config) -> Jmvae:
     """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
+    checks.require_type("config", config, Config, "all settings")
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 

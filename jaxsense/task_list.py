@@ -1,6 +1,5 @@
 """`jaxsense tasks`: the frozen tasks, and what known policies reach in them."""
 
-import contextlib
 import dataclasses
 import sys
 
@@ -8,9 +7,11 @@ import numpy as np
 import rich.console
 
 from jaxsense import tasks
-from jaxsense.run import cli
+from jaxsense.config import ConfigError
+from jaxsense.run import cli, devices, output
+from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
-from jaxsense.show.terminal import print_table, say
+from jaxsense.show.terminal import as_text
 from jaxsense.tasks import Task
 
 PROGRAM = "jaxsense tasks"
@@ -30,16 +31,19 @@ def main(argv: list[str] | None = None) -> None:
       argv: the command line without the program; by default the process's own.
     """
     cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    try:
+        devices.start(1)
+    except ConfigError as error:
+        cli.fail(PROGRAM, str(error))
     found = [tasks.make(name, agent) for name in tasks.registered() for agent in tasks.agents(name)]
-    with contextlib.suppress(OSError):  # as in `say`
-        print_table(rich.console.Console(), _table(found))
+    tell(as_text(rich.console.Console(), _table(found)))
     for name in tasks.registered():
-        say(f"{name}: {tasks.about(name)}.")
-    say(
+        tell(f"{name}: {tasks.about(name)}.")
+    tell(
         f"Returns are interquartile means over {tasks.SEEDS} seeds of {tasks.EPISODES:,} episodes, "
         f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies."
     )
-    say('Next, in Python: jaxsense.score("noisy-v0", policy)')
+    tell('Next, in Python: jaxsense.score("noisy-v0", policy)')
 
 
 def _table(found: list[Task]) -> Table:
@@ -61,4 +65,4 @@ def _table(found: list[Task]) -> Table:
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

@@ -21,17 +21,18 @@ from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.run import cli, devices, files, pipeline, processes, rundir, seeds
+from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
-from jaxsense.show.terminal import Display, print_table, say
+from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare, statistics
 from jaxsense.summary.blocks import Header
 
@@ -140,8 +141,7 @@ def main(
     if not is_first:
         return
     if not arguments.quiet:
-        with contextlib.suppress(OSError):  # as in `say`
-            _print_summary(console, run)
+        _print_summary(console, run)
     first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
@@ -273,10 +273,10 @@ def _train(
             again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
             again += " --trust" if settings.config.sensors else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
-            cli.complain(f"Stopped; all training so far is saved. To resume: {again}")
+            output.complain(f"Stopped; all training so far is saved. To resume: {again}")
         # Other processes may be blocked in a collective; wait only briefly.
         processes.leave(processes.LEAVE_TIMEOUT)
-        sys.exit(cli.INTERRUPTED)
+        sys.exit(output.INTERRUPTED)
     if len(failed) == settings.num_seeds:
         sys.exit(2)
     # Another process has none of the seeds that were finished before.
@@ -299,6 +299,9 @@ def _train_together(
             records.append(tensorboard.make_writer(run.path / "tensorboard"))
         return Display(console, records, quiet=arguments.quiet or run is not runs[0])
 
+    for run in runs:
+        if several := compare.several_origins(run.made("mission")):
+            _warn(f"{run.path}: {several}")
     displays = [display(run) for run in runs]
     programs.trainings.begin(len(runs))
     artist, failed = Artist(), dict[int, str]()
@@ -329,7 +332,8 @@ def _train_together(
                 _warn(f"{result}; earlier checkpoints are in {run.path}")
                 continue
             monitor.check_stop()
-            found: summary.Summary = {**_header(run), "timing": timing, **result}
+            header = _header(run, run.made("mission"))
+            found: summary.Summary = {**header, "timing": timing, **result}
             _report().write(run, drawn[run.path], found)
             monitor.check_stop()
             # Last, for it marks the run as finished.
@@ -340,8 +344,10 @@ def _train_together(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
-    timing, of_each, means = statistics.of_seeds([summary.read(path) for path in paths])
-    found: summary.Summary = {**_header(run), "timing": timing, "seeds": of_each, **means}
+    summaries = [summary.read(path) for path in paths]
+    timing, of_each, means = statistics.of_seeds(summaries)
+    header = _header(run, [*statistics.made(summaries), *run.made("means")])
+    found: summary.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
@@ -361,13 +367,14 @@ def _warn(text: str) -> None:
     cli.warn(PROGRAM, text)
 
 
-def _header(run: RunDirectory) -> Header:
-    """A summary's keys about the run itself."""
-    return {
+def _header(run: RunDirectory, made: list[summary.Made]) -> Header:
+    """A summary's keys about the run itself, with what made its stages if that differs."""
+    found: Header = {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
         **rundir.origin(),
     }
+    return {**found, "origins": made} if compare.differences_of(made) else found
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
@@ -379,12 +386,12 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     say(f"{settings.preset} preset, {which}, {found['timing']['total_s']:.0f} s in total")
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
-        print_table(console, table)
+        say(as_text(console, table))
     if verdict := compare.verdict(summary.cases(found["mission"])):
         say(verdict)
-    for remark in compare.remarks(settings.preset, found["belief"]):
+    for remark in compare.remarks(found):
         say(remark)
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    output.run(main)

@@ -25,6 +25,7 @@ SUMMARY = {
     "versions": {"jaxsense": "0.1.0", "jax": "<0.10>"},
     "devices": ["cpu", "cpu"],
     "cores": 2,
+    "source": "0a1b2c3d4e5f6071",
     "date": "2026-11-26",
     "timing": {"total_s": 23.7, "stages": {"jmvae": {"compile_s": 1.5, "run_s": 4.5}}},
     "detectors": {"camera": DETECTOR, "lidar": DETECTOR},
@@ -53,6 +54,7 @@ ORIGIN = {
     "versions": {"python": "3.12.3", "jax": "0.11.2", "mujoco": "3.17.0"},
     "devices": ["NVIDIA H200"],
     "cores": 16,
+    "source": "8091a2b3c4d5e6f7",
     "date": "2026-11-30",
     "commit": "fedcba9876543210",
 }

@@ -45,7 +45,7 @@ def test_version_and_help_import_no_jax(option, told):
 def run(monkeypatch, *argv, name="jaxsense"):
     """Runs the command in this process, as the console script does."""
     monkeypatch.setattr(sys, "argv", [f"/some/bin/{name}", *argv])
-    commands.main()
+    commands.run()
 
 
 def test_help_has_a_line_for_each_command(monkeypatch, capsys):
@@ -177,7 +177,6 @@ def played(models, monkeypatch, tmp_path):
 
     monkeypatch.setattr(demo, "load_pretrained", load)
     monkeypatch.setattr(demo.missions, "Player", Player)
-    monkeypatch.setattr(demo.gc, "disable", lambda: None)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -173,6 +173,54 @@ assert jax.config.jax_num_cpu_devices == number
     subprocess.run([sys.executable, "-c", script], check=True)
 
 
+def test_functions_of_the_library_leave_the_process_as_it_was(tmp_path):
+    code = """
+import gc, os, sys, warnings
+from pathlib import Path
+import jax
+import jaxsense
+from jaxsense.run import devices, kept
+
+def state():
+    return dict(os.environ), dict(jax.config.values), gc.get_threshold(), warnings.filters[:]
+
+before = state()
+devices.threads()
+devices.compiler_options()
+kept.Kept(Path(sys.argv[1]))
+task = jaxsense.make("map-v0", "camera")
+jaxsense.score(task, lambda key, observation: jax.numpy.int32(3), episodes=2)
+jaxsense.load_pretrained("noisy")
+assert state() == before
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["tasks"],
+        # Each imports JAX.
+        pytest.param(["train", "--preset", "smoke", "--out", "run"], marks=pytest.mark.slow),
+        pytest.param(["demo", "--no-browser", "--out", "run"], marks=pytest.mark.slow),
+        pytest.param(["export", "pretrained:noisy", "--out", "run"], marks=pytest.mark.slow),
+    ],
+    ids=lambda argv: argv[0],
+)
+@pytest.mark.parametrize("name", ["nonsense", pytest.param("cuda", marks=pytest.mark.slow)])
+def test_a_platform_that_is_not_there_is_named_in_one_line(name, argv, tmp_path):
+    command = [sys.executable, "-m", "jaxsense", *argv]
+    environment = {**os.environ, "JAX_PLATFORMS": name}
+    done = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f": JAX_PLATFORMS = '{name}': must name devices of this machine (" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch):
     for number in (0, -1, 10**9):
         with pytest.raises(ConfigError, match=rf"devices = {number}: must be from 1 to 256"):

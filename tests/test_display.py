@@ -7,7 +7,7 @@ import pytest
 import rich.console
 
 from jaxsense.show.tables import Table
-from jaxsense.show.terminal import Display, print_table
+from jaxsense.show.terminal import Display, as_text
 
 
 def show(display):
@@ -52,17 +52,13 @@ def test_a_quiet_display_records_and_shows_nothing(capsys):
 
 def test_a_table_is_not_cut_without_a_terminal():
     table = Table("caption", [f"column {n} " + "x" * 20 for n in range(9)], [("row", ["1"] * 9)])
-    text = io.StringIO()
-    print_table(rich.console.Console(file=text, width=80), table)
-    assert all(name in text.getvalue() for name in table.columns)
-    narrow = io.StringIO()
-    print_table(rich.console.Console(file=narrow, width=80, force_terminal=True), table)
-    assert not any(name in narrow.getvalue() for name in table.columns)
+    text = as_text(rich.console.Console(file=io.StringIO(), width=80), table)
+    assert all(name in text for name in table.columns)
+    narrow = rich.console.Console(file=io.StringIO(), width=80, force_terminal=True)
+    assert not any(name in as_text(narrow, table) for name in table.columns)
 
 
 def test_the_note_of_a_table_stands_below_it():
-    text = io.StringIO()
-    console = rich.console.Console(file=text, width=80)
-    print_table(console, Table("caption", ["column"], [("row", ["1"])], note="why [x] " + "y" * 90))
-    *_, last = text.getvalue().rstrip().splitlines()
-    assert last == "why [x] " + "y" * 90
+    table = Table("caption", ["column"], [("row", ["1"])], note="why [x] " + "y" * 90)
+    *_, last = as_text(rich.console.Console(file=io.StringIO(), width=80), table).splitlines()
+    assert last == table.note

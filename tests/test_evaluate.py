@@ -6,6 +6,7 @@ import functools
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -47,18 +48,6 @@ NAME = "3-points-3-m-1-camera-1-lidar-seed-0-1-missions"
 
 def read(path, name=NAME):
     return json.loads((path / "evaluations" / f"{name}.json").read_text(encoding="utf-8"))
-
-
-def test_origins_are_alike_on_other_days_only():
-    origin = {
-        "versions": {"jax": "0.10.2"},
-        "devices": ["cpu"],
-        "date": "2026-11-28",
-        "commit": "a",
-    }
-    assert evaluate._is_alike({**origin, "date": "2026-11-29"}, origin)
-    assert not evaluate._is_alike({**origin, "commit": "b"}, origin)
-    assert not evaluate._is_alike(None, origin)
 
 
 def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated):
@@ -105,6 +94,53 @@ def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path)
     assert of_seed["nearest"]["seed"] == 3
     page = (path / "report.html").read_text(encoding="utf-8")
     assert page.count("Evaluation: 3 PoIs in 3 m") == 2
+
+
+@pytest.mark.parametrize("other", ["code", "JAX", "unknown"])
+def test_evaluations_by_others_stand_apart(evaluated, tmp_path, other):
+    path = tmp_path / "run"
+    shutil.copytree(evaluated[0], path)
+    before, origin = read(path), rundir.origin()
+    made = {
+        "code": {**origin, "source": "other"},
+        "JAX": {**origin, "versions": {**origin["versions"], "jax": "0.0.1"}},
+        "unknown": None,
+    }[other]
+    before = {**before, "origin": made} if made else {**before}
+    if made is None:
+        del before["origin"]
+    file = path / "evaluations" / f"{NAME}.json"
+    file.write_text(json.dumps(before))
+    one = {name: before["mission"][name] for name in ("nearest", "bytes_per_detection")}
+    for _ in range(2):  # the second time, among those that this code has made
+        write(evaluate.Arguments(path, episodes=1), one)
+    assert json.loads(file.read_text()) == before
+    apart = read(path, f"{NAME}-2")
+    assert set(apart["mission"]) == {"nearest", "bytes_per_detection"}
+    assert apart["origin"] == origin
+    assert len([*(path / "evaluations").glob("*.json")]) == 2
+    titles = re.findall(
+        "<h3>Evaluation: (.*)</h3>", (path / "report.html").read_text(encoding="utf-8")
+    )
+    words = {"code": "source other", "JAX": "jax 0.0.1", "unknown": "source unknown"}[other]
+    ours, theirs = sorted(titles, key=len)
+    assert ours == "3 PoIs in 3 m; robots: 1 camera, 1 lidar; seed 0"
+    assert theirs.startswith(f"{ours}; ")
+    assert f"; {words}" in theirs
+
+
+def test_a_plot_of_teams_compares_figures_of_one_origin(evaluated, tmp_path, monkeypatch):
+    path, drawn = tmp_path / "run", []
+    shutil.copytree(evaluated[0], path)
+    monkeypatch.setattr(evaluate.mission_plots, "teams", drawn.append)
+    monkeypatch.setattr(evaluate.drawing, "svg", lambda plot: b"")
+    here = read(path)
+    own = {"origin": here["origin"], "other": {**here["origin"], "commit": "other"}}
+    for pois, origin in ((4, own["origin"]), (5, own["other"])):
+        place = {**here, "num_pois": pois, "origin": origin}
+        (path / "evaluations" / f"{pois}.json").write_text(json.dumps(place))
+    evaluate._report(path, jaxsense.load(path)[0])
+    assert sorted(place["num_pois"] for place in drawn[0]) == [3, 3, 4]
 
 
 def test_an_evaluation_of_robots_that_are_alone_has_no_plot_of_policies(evaluated, tmp_path):
@@ -164,15 +200,15 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
     program = """
 import os, sys
 from jaxsense import train
-from jaxsense.run import cli
+from jaxsense.run import output
 train._train = lambda monitor, arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 resume = lambda: train.main(["--resume", sys.argv[2]])
-cli.run(resume)
+output.run(resume)
 sys.stdout.flush()
 os.unlink(os.path.join(sys.argv[2], "summary.json"))
 os.dup2(os.open("/dev/full", os.O_WRONLY), sys.stdout.fileno())
-cli.run(resume)
+output.run(resume)
 """
     command = [sys.executable, "-c", program, str(smoke_run / "summary.json"), str(path)]
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

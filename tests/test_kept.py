@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -17,7 +18,7 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, files
+from jaxsense.run import cli, files, version
 from jaxsense.run import kept as kept_programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.kept import Kept
@@ -30,6 +31,9 @@ def call(kept, function, *args):
         program = Program(compiler, "stage", "run")
         program.compile(function, *args)
         return program(*args)
+
+
+TOLD = "jaxsense: {}: a program must be traced again ("
 
 
 def never(*_):
@@ -119,13 +123,32 @@ def test_the_numbers_of_settings_are_no_other_program(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"no program", None])
-def test_a_damaged_file_is_traced_anew(tmp_path, damage):
+def test_a_damaged_file_is_traced_anew(tmp_path, damage, capsys):
     kept = Kept(tmp_path)
     assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
     (file,) = kept.path.glob("*.stablehlo")
-    file.write_bytes(file.read_bytes()[:-100] if damage is None else damage)
-    assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
+    assert capsys.readouterr().err == ""
+    for told in (f"{TOLD.format(kept.path)}ValueError wrong digest)\n", ""):  # once
+        file.write_bytes(file.read_bytes()[:-100] if damage is None else damage)
+        assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
+        assert capsys.readouterr().err == told
     assert call(kept, never, jnp.float32(3)) == 6
+
+
+def test_a_fault_of_the_cache_shows_and_ends_nothing(tmp_path, capsys, monkeypatch):
+    kept = Kept(tmp_path)
+    call(kept, lambda x: 2 * x, jnp.float32(3))
+    monkeypatch.setattr(kept_programs.export, "deserialize", never)
+    assert call(kept, lambda x: 2 * x, jnp.float32(3)) == 6
+    assert capsys.readouterr().err == f"{TOLD.format(kept.path)}AssertionError traced)\n"
+
+
+def test_the_error_of_a_program_is_its_own(tmp_path):
+    def fails(x):
+        raise ValueError("mine")
+
+    with pytest.raises(ValueError, match="mine"):
+        call(Kept(tmp_path), fails, jnp.float32(3))
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no modes of files")
@@ -159,7 +182,7 @@ def test_programs_are_held_by_their_arguments(tmp_path):
     assert not Kept(tmp_path, "others").holds("stage-run", (jnp.float32(3),))
 
 
-def test_what_jax_cannot_write_is_traced_every_time(tmp_path):
+def test_what_jax_cannot_write_is_traced_every_time(tmp_path, capsys):
     kept = Kept(tmp_path)
 
     def function(x):
@@ -168,14 +191,18 @@ def test_what_jax_cannot_write_is_traced_every_time(tmp_path):
     for _ in range(2):
         assert call(kept, function, jnp.float32(3)) == 6
     assert not list(kept.path.glob("*.stablehlo"))
+    told = capsys.readouterr().err
+    assert told.startswith(f"{TOLD.format(kept.path)}NotImplementedError")
+    assert told.count("\n") == 1
 
 
-def test_a_full_disk_ends_nothing(tmp_path, monkeypatch):
+def test_a_full_disk_ends_nothing(tmp_path, monkeypatch, capsys):
     def full(*args, **options):
         raise files.WriteError(28, "No space left on device")
 
     monkeypatch.setattr(files, "write_digested", full)
     assert call(Kept(tmp_path), lambda x: 2 * x, jnp.float32(3)) == 6
+    assert "(WriteError [Errno 28] No space left on device)\n" in capsys.readouterr().err
 
 
 def test_options_of_jax_are_other_settings(tmp_path):
@@ -208,9 +235,10 @@ def two_processes(tmp_path_factory):
     code = """if True:
         import sys, jax, jax.numpy as jnp
         from jaxsense.run.compilation import Compiler, Program
-        from jaxsense.run.kept import Kept
+        from jaxsense.run.kept import Kept, use_cache
         from jaxsense.run.monitor import Monitor
         from pathlib import Path
+        use_cache(Path(sys.argv[1]))
         kept = Kept(Path(sys.argv[1]))
         print("kept" if list(kept.path.iterdir()) else "new")
         with Compiler(Monitor(), kept) as compiler:
@@ -295,16 +323,27 @@ def test_another_source_or_processor_is_another_program(tmp_path, monkeypatch):
         assert not is_there()
     processor.write_text("model name : Abacus\nflags : add\n")
     assert is_there()
-    (name, digest), *others = kept_programs._SOURCE
-    monkeypatch.setattr(kept_programs, "_SOURCE", [(name, digest[::-1]), *others])
+    monkeypatch.setattr(version, "SOURCE", version.SOURCE[::-1])
     assert not is_there()
 
 
-def test_the_source_is_that_of_the_whole_package():
-    names = {name for name, _ in kept_programs._SOURCE}
-    assert {"kept.py", "detectors.py", "__init__.py", "cli.py"} <= names
+def test_the_source_is_that_of_the_whole_package(tmp_path):
     root = Path(jaxsense.__file__).parent
-    assert len(kept_programs._SOURCE) == len(list(root.rglob("*.py")))
+    shutil.copytree(root, tmp_path / "jaxsense", ignore=shutil.ignore_patterns("*.pyc"))
+    code = "from jaxsense.run import version; print(version.__file__, version.SOURCE)"
+
+    def told():
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-c", code]
+        found = subprocess.check_output(command, env=environment, cwd=tmp_path, text=True)
+        file, source = found.split()
+        assert file == str(tmp_path / "jaxsense" / "run" / "version.py")
+        return source
+
+    assert told() == version.SOURCE
+    with (tmp_path / "jaxsense" / "vae" / "gaussian.py").open("a", encoding="utf-8") as file:
+        file.write("\n")
+    assert told() != version.SOURCE
 
 
 def test_programs_of_custom_sensors_are_not_kept(tmp_path):
@@ -327,17 +366,17 @@ def test_what_another_user_owns_is_not_run(tmp_path, monkeypatch):
     own = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: own + 1)
     assert kept.find("stage-run", (x,)) is None
-    with pytest.raises(PermissionError, match="compiled must be a directory that you own"):
+    with pytest.raises(PermissionError, match="traced must be a directory that you own"):
         Kept(tmp_path)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no modes of files")
 def test_a_directory_that_others_may_write_is_refused(tmp_path):
-    Kept(tmp_path)
-    for name in ("compiled", "traced"):
+    for name, begin in (("compiled", kept_programs.use_cache), ("traced", Kept)):
+        begin(tmp_path)
         (tmp_path / name).chmod(0o770)
         with pytest.raises(PermissionError, match=f"{name} must be a directory that you own"):
-            Kept(tmp_path)
+            begin(tmp_path)
         (tmp_path / name).chmod(0o700)
 
 

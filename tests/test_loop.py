@@ -17,6 +17,7 @@ import pytest
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, loop, missions, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.compilation import Program
 from jaxsense.run.kept import Kept
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -77,6 +78,18 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
     curves = found.curves["count"]
     np.testing.assert_array_equal(curves["double"], [2, np.nan, 6, 8, 10])
     assert len(curves["seconds"]) == 3
+
+
+def test_the_output_of_a_training_is_computed_once(toy, monkeypatch):
+    call, calls = Program.__call__, []
+
+    def counted(self, *args):
+        calls.append(self._name)
+        return call(self, *args)
+
+    monkeypatch.setattr(Program, "__call__", counted)
+    toy(counting("count"))
+    assert calls == ["begin", *["advance"] * 3, "finish"]
 
 
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
@@ -332,6 +345,7 @@ import os, signal, sys, time
 from pathlib import Path
 import numpy as np
 from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.compilation import Program
 from jaxsense.run.kept import Kept
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor

@@ -29,7 +29,7 @@ from jaxsense.core import supervised
 from jaxsense.core.supervised import FitState
 from jaxsense.dqn import training as dqn_training
 from jaxsense.dqn.training import DqnState
-from jaxsense.run import cli, rundir
+from jaxsense.run import output, rundir
 from jaxsense.run.compilation import Program
 from jaxsense.show import plots
 from jaxsense.training.stage import Progress
@@ -170,13 +170,13 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if stage in OTHERS:
         fill_disk()
-        cli.run(lambda: OTHERS[stage].main(argv))
+        output.run(lambda: OTHERS[stage].main(argv))
     elif fault.startswith("gradient"):
         poison_gradients(stage, int(fault.removeprefix("gradient")))
-        cli.run(lambda: train.main(argv))
+        output.run(lambda: train.main(argv))
     elif fault == "clock":
         rundir.datetime = StoppedClock
-        cli.run(lambda: train.main(argv))
+        output.run(lambda: train.main(argv))
     else:
         strike_at(stage, fault)
-        cli.run(lambda: train.main(argv))
+        output.run(lambda: train.main(argv))

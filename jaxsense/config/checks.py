@@ -163,7 +163,8 @@ def check_fields(section: object, bits: int = 31) -> None:
             expected = f"must be {_described(kind)}"
             raise ConfigError(_place(section, name), value, expected) from None
         object.__setattr__(section, name, value)
-        fits = not isinstance(value, int) or abs(value) < 2**bits
+        numbers = value if isinstance(value, tuple) else (value,)
+        fits = all(abs(each) < 2**bits for each in numbers if isinstance(each, int))
         require(fits, section, name, f"must be below 2^{bits}")
         for place, each in _parts(_place(section, name), value):
             if limits is not None and not limits.allow(each):

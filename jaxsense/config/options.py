@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Literal, NoReturn, TypeVar, cast, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
+_LONGEST = 300  # characters of an error of `argparse`, which repeats values
 _Values = Mapping[tuple[str, ...], object]
 """Values of options, by the fields that lead to them."""
 
@@ -273,7 +274,7 @@ class _Parser(argparse.ArgumentParser):
     """Raises errors."""
 
     def error(self, message: str) -> NoReturn:
-        raise OptionError(message)
+        raise OptionError(message if len(message) <= _LONGEST else f"{message[:_LONGEST]} ...")
 
 
 def _split(options: list[_Option], argv: list[str]) -> tuple[_Values, list[str]]:
@@ -283,6 +284,9 @@ def _split(options: list[_Option], argv: list[str]) -> tuple[_Values, list[str]]
         option.add_to(parser)
     # `--num_seeds` is `--num-seeds`.
     words = [re.sub("^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in argv]
+    if separator := next((word for word in words if re.fullmatch("--[^=]+=--", word)), None):
+        # Up to Python 3.12, `argparse` drops the value.
+        parser.error(f"argument {separator[:-3]}: expected a value other than --")
     found, unknown = parser.parse_known_args(words)
     values = vars(found)
     given = [option for option in options if option.name in values]

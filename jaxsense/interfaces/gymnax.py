@@ -22,7 +22,7 @@ with extra("gymnax"):
 
 
 @pytree
-class MapEnvState(environment.EnvState):
+class MapEnvState(environment.EnvState):  # pyright: ignore[reportGeneralTypeIssues]
     """State of `MapEnv`.
 
     Attributes:
@@ -36,7 +36,7 @@ class MapEnvState(environment.EnvState):
 
 
 @pytree
-class MapEnvParams(environment.EnvParams):
+class MapEnvParams(environment.EnvParams):  # pyright: ignore[reportGeneralTypeIssues]
     """Parameters of `MapEnv`: length of episodes, and prepared starts.
 
     Attributes:

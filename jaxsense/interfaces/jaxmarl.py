@@ -21,7 +21,7 @@ with extra("jaxmarl"), quietly():
 
 
 @pytree
-class TeamEnvState(multi_agent_env.State):
+class TeamEnvState(multi_agent_env.State):  # pyright: ignore[reportGeneralTypeIssues]
     """State of `TeamEnv`.
 
     Attributes:

@@ -57,14 +57,16 @@ class Checkpoints:
         self,
         path: Path | None = None,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
+        saved: Callable[[str], None] = lambda name: None,
     ):
         """Opens a directory, which need not exist.
 
         Args:
           path: the directory.
           warn: receives a line about each damaged checkpoint.
+          saved: receives the name of each checkpoint once it is saved.
         """
-        self.path, self._warn = path, warn
+        self.path, self._warn, self._saved = path, warn, saved
         self._lock = threading.Lock()
 
     def exists(self) -> bool:
@@ -90,6 +92,7 @@ class Checkpoints:
         self._write(name, serialization.to_state_dict(jax.tree.map(np.asarray, tree)))
         with self._lock:
             self._list(self._listed() | {name})
+            self._saved(name)
 
     def load(self, name: str, shapes: PyTree[T]) -> PyTree[np.ndarray] | None:
         """Loads a checkpoint.

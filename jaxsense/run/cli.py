@@ -1,11 +1,8 @@
-"""Runs command lines: options, exit statuses, and user errors in one line."""
+"""Reads command lines; user errors end a program in one line."""
 
-import contextlib
-import gc
-import io
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -14,16 +11,14 @@ import jax
 from jaxsense.config import Config, ConfigError, options, require_32_bits
 from jaxsense.run import kept, rundir
 from jaxsense.run.kept import Kept
+from jaxsense.run.output import complain, tell
 from jaxsense.tasks import pretrained
 
 T = TypeVar("T")
 
-CACHE = Path("~/.cache/jaxsense")
+_CACHES = Path(os.environ.get("XDG_CACHE_HOME", ""))
+CACHE = (_CACHES if _CACHES.is_absolute() else Path("~/.cache")) / "jaxsense"
 """Where compiled programs are kept for later calls."""
-# Exit statuses, as in shells.
-INTERRUPTED = 130
-_CLOSED = 141
-_RARELY = 100_000, 50, 50  # see `gc.set_threshold`
 
 
 def parse(
@@ -51,46 +46,13 @@ def parse(
     base = arguments if default is None else default
     if {"-h", "--help", "--help-all"} & set(argv):
         is_all = "--help-all" in argv
-        print(options.describe(program, base, () if is_all else common), end="")
+        tell(options.describe(program, base, () if is_all else common).rstrip("\n"))
         sys.exit(0)
     try:
         require_32_bits()
         return options.read(base, argv)
     except (ConfigError, options.OptionError) as error:
         fail(program, str(error))
-
-
-def run(main: Callable[[], None]) -> None:
-    """Runs a program; Ctrl-C ends it without a traceback."""
-    # Tracing makes and drops millions of small objects; by default, looking for circles among them
-    # takes a sixth of its time.
-    gc.set_threshold(*_RARELY)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        # The terminal may be unable to show the name of a directory.
-        sys.stdout.reconfigure(errors="backslashreplace")
-    try:
-        main()
-    except KeyboardInterrupt:
-        complain("Interrupted.")
-        _exit(INTERRUPTED)
-    except BrokenPipeError:  # for example `--help | head`
-        _exit(_CLOSED)
-    except SystemExit as stop:
-        _exit(stop.code if isinstance(stop.code, int) else int(stop.code is not None))
-
-
-def _exit(status: int) -> NoReturn:
-    """Ends the process immediately: any other exit would wait for compiling threads."""
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):
-            stream.flush()
-    os._exit(status)
-
-
-def complain(text: str) -> None:
-    """Prints a line to standard error, if it is still open."""
-    with contextlib.suppress(OSError):
-        print(text, file=sys.stderr, flush=True)
 
 
 def warn(program: str, message: str) -> None:
@@ -174,8 +136,8 @@ def keep_programs(
         return None
     try:
         directory = directory.expanduser()
+        kept.use_cache(directory)
         if config.sensors or has_own_code:
-            kept.use_cache(directory)
             return None
         return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:

@@ -128,7 +128,9 @@ def check(number: int | None) -> None:
 
 
 def start(number: int | None) -> Workers:
-    """Selects the devices of a program.
+    """Begins a command: sets the precision of products and XLA's threads, and selects its devices.
+
+    Both are set for the whole process, so only commands call this.
 
     Args:
       number: of accelerators, at least one of each process, or of threads on a CPU. By default all
@@ -138,13 +140,21 @@ def start(number: int | None) -> Workers:
       The workers that share scenes and missions. A training stays on one device.
 
     Raises:
-      ConfigError: if there are fewer devices, or a process would have none.
+      ConfigError: if there are fewer devices, none of the platform that `JAX_PLATFORMS` names, or
+        a process would have none.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
     check(number)
-    number_of_threads = threads(number or NUM_THREADS)
-    if jax.default_backend() == "cpu" and jax.process_count() == 1:
-        return Workers(threads=number_of_threads)
+    wanted = number or NUM_THREADS
+    if not _has_backend():
+        os.environ.setdefault("NPROC", str(max(2 * wanted, cores())))
+    try:
+        is_cpu = jax.default_backend() == "cpu"
+    except (AssertionError, RuntimeError) as error:
+        reason = f"must name devices of this machine ({str(error) or 'its plugin is missing'})"
+        raise ConfigError("JAX_PLATFORMS", jax.config.values["jax_platforms"], reason) from None
+    if is_cpu and jax.process_count() == 1:
+        return Workers(threads=threads(wanted))
     owners = [device.process_index for device in jax.devices()]
     least, there = 1 + owners.index(max(owners)), len(owners)
     number = there if number is None else number
@@ -160,14 +170,11 @@ def threads(wanted: int = NUM_THREADS) -> int:
 
     A member of the pool splits a large batch of Cholesky decompositions, as in the physics of six
     robots, among the pool, and waits for the others. If every member does so, all wait forever.
-    XLA reads the size when it creates the backend, so until then this makes the pool large enough;
-    its default is the number of cores.
+    XLA reads the size from `NPROC` when it creates the backend; its default is the number of cores.
 
     Args:
       wanted: number of programs.
     """
-    if not _has_backend():
-        os.environ.setdefault("NPROC", str(max(2 * wanted, cores())))
     given = os.environ.get("NPROC", "")
     return min(wanted, max(1, (int(given) if given.isdecimal() else cores()) - 1))
 

@@ -4,7 +4,6 @@ import contextlib
 import hashlib
 import os
 import pickle
-import platform
 import re
 import stat
 import warnings
@@ -16,20 +15,15 @@ import jax
 from jax import export
 from jaxtyping import PyTree
 
-from jaxsense.run import files
-from jaxsense.run.version import versions
+from jaxsense.run import files, version
+from jaxsense.run.output import complain
 
 Function: TypeAlias = Callable[..., PyTree]
 
-# Read at import, so that it matches the code that runs.
-_SOURCE = [
-    (path.name, hashlib.sha256(path.read_bytes()).hexdigest())
-    for path in sorted(Path(__file__).parents[1].rglob("*.py"))
-]
 _MAX_KEPT = 512  # traced programs; a run has about twenty
 _MAX_BYTES = 2**31  # of compiled programs
-_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
 _CPU_INFO = Path("/proc/cpuinfo")
+_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
 
 
 class Traced(NamedTuple):
@@ -68,7 +62,7 @@ class Kept:
         """Opens the cache, and removes the least recently used programs.
 
         Args:
-          directory: holds the traced programs, and JAX's compilation cache.
+          directory: holds the traced programs.
           *settings: everything outside jaxsense's source that programs close over, as values whose
             `repr` tells them apart.
 
@@ -76,10 +70,9 @@ class Kept:
           OSError: if the directory cannot be made, or if other users may write to it: loading a
             program runs it.
         """
-        use_cache(directory)
-        self.path = directory / "traced"
+        self.path, self._told = directory / "traced", set[str]()
         _make_private(self.path)
-        self._depends = repr((settings, _SOURCE, _surroundings())).encode()
+        self._depends = repr((settings, _surroundings())).encode()
         # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
             self._forget_oldest()
@@ -107,21 +100,23 @@ class Kept:
           args: its arguments or their shapes.
 
         Returns:
-          The program; None if its file is missing or damaged.
+          The program; None if its file is missing or, with a line to standard error, damaged.
         """
-        # Tracing the program again repairs any file.
-        with contextlib.suppress(Exception):
-            path = self._file(name, args)
+        path = self._file(name, args)
+        try:
             with path.open("rb") as file:
                 if not _is_private(os.fstat(file.fileno()), 0o022):
-                    return None
+                    raise PermissionError("other users may have written it")
                 content = file.read()
             # A single wrong bit could end the process.
             structure, flat = pickle.loads(files.without_digest(content))
             found = Traced(export.deserialize(bytearray(flat)), structure)
             path.touch()
             return found
-        return None
+        except FileNotFoundError:
+            return None
+        except Exception as error:  # tracing the program again repairs any file
+            return self._tell(error)
 
     def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
         """Finds a cached program, or traces and caches a new one.
@@ -132,7 +127,8 @@ class Kept:
           args: its arguments or their shapes.
 
         Returns:
-          The program; None if it cannot be exported.
+          The program; None if it cannot be exported. A line to standard error says why it cannot be
+          loaded, exported or cached.
         """
         found = self.find(name, args)
         if found is not None:
@@ -140,11 +136,20 @@ class Kept:
         # A run must not end because the next one will be slower: where a program calls something
         # that JAX cannot export, or on a full disk.
         traced = None
-        with contextlib.suppress(Exception):
+        try:
             traced = trace(function, args)
             content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
             files.write_digested(self._file(name, args), content, mode=0o600)
+        except Exception as error:
+            self._tell(error)
         return traced
+
+    def _tell(self, error: Exception) -> None:
+        """Tells once why programs are slower to start than they could be."""
+        reason = " ".join(f"{type(error).__name__} {error}".splitlines()[:1])
+        if reason not in self._told:
+            self._told.add(reason)
+            complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
@@ -224,13 +229,13 @@ def _surroundings() -> list[object]:
         features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
     variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
     return [
-        versions(),
+        version.SOURCE,
+        version.versions(),
         sorted((name, value) for name, value in variables if not _sets_cache(name)),
         sorted((name, str(x)) for name, x in jax.config.values.items() if not _sets_cache(name)),
         jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
         sorted(features),
-        platform.python_version(),
     ]
 
 

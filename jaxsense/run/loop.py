@@ -194,8 +194,7 @@ class _Loop:
             begin = time.perf_counter()
             state, progress = programs.advance(keys[chunk], config, state, inputs)
             seconds = time.perf_counter() - begin
-            output = programs.finish(config, state, inputs)
-            curves = self._report(stage, chunk, progress, output)
+            curves = self._report(stage, chunk, progress)
             return state, {**curves, "seconds": [seconds]}
 
         try:
@@ -216,8 +215,8 @@ class _Loop:
         self._curves[stage.name] = curves
         return programs.finish(config, state, inputs)
 
-    def _report(self, stage: Stage, chunk: int, progress: Progress, output: Output) -> Curves:
-        """Reports a chunk, checks the output so far, and returns the steps' metrics."""
+    def _report(self, stage: Stage, chunk: int, progress: Progress) -> Curves:
+        """Reports a chunk, checks its losses, and returns the steps' metrics."""
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
         losses, metrics = jax.tree.map(
@@ -228,7 +227,7 @@ class _Loop:
             for name, values in metrics.items()
             if np.isfinite(values).any()
         }
-        self._monitor.report(stage.name, done, stage.steps, losses, output, **means)
+        self._monitor.report(stage.name, done, stage.steps, losses, **means)
         return {name: values.tolist() for name, values in metrics.items()}
 
     def _load(self, stage: Stage) -> Output:

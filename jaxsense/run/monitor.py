@@ -160,7 +160,7 @@ class Monitor:
 
         Args:
           stage: its name.
-          name: of the values, for example "parameters at step 20 of 40".
+          name: of the values, for example "results".
           values: a pytree of arrays.
 
         Raises:
@@ -175,7 +175,6 @@ class Monitor:
         done: int,
         total: int,
         losses: np.ndarray,
-        params: PyTree = (),
         **metrics: float,
     ) -> None:
         """Reports a chunk of training.
@@ -184,16 +183,15 @@ class Monitor:
           stage: its name.
           done: steps so far, including the chunk.
           total: steps of the whole stage.
-          losses: `[steps]` of the chunk; their mean is reported.
-          params: parameters after the chunk.
+          losses: `[steps]` of the chunk; their mean is reported. The last is not finite if the
+            parameters after it are not, see `supervised.fit` and `dqn.train_chunk`.
           **metrics: other metrics.
 
         Raises:
-          StageError: if a loss or a parameter is not finite; names the step.
+          StageError: if a loss is not finite; names the step.
         """
         bad = np.flatnonzero(~np.isfinite(losses))
         if len(bad):
             step = done - len(losses) + bad[0] + 1
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
-        self.check_finite(stage, f"parameters after step {done} of {total}", params)
         self._listener(stage, done, total, {"loss": float(np.mean(losses)), **metrics})

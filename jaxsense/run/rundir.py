@@ -1,9 +1,10 @@
 """Run directories: creates, resumes and reads them."""
 
 import contextlib
+import functools
 import itertools
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
@@ -16,12 +17,14 @@ from jaxsense.models import Models
 from jaxsense.run import devices, files, version
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.settings import Settings, as_json, of_run, resumable
-from jaxsense.summary import Origin
+from jaxsense.summary import Made, Origin
+from jaxsense.summary.compare import UNKNOWN
+from jaxsense.summary.read import read_made
 from jaxsense.tasks.pretrained import PREFIX, PRETRAINED, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
 
-_METRICS = "metrics.jsonl"
+_METRICS, _ORIGINS = "metrics.jsonl", "origins.json"
 
 
 class RunDirectory:
@@ -35,7 +38,8 @@ class RunDirectory:
 
     def __init__(self, path: Path, settings: Settings):
         self.path, self.settings = path, settings
-        self.checkpoints = Checkpoints(path / "checkpoints")
+        self.checkpoints = Checkpoints(path / "checkpoints", saved=self._sign)
+        self._made: list[Made] = []
         self._reported: dict[str, int] = {}
 
     @classmethod
@@ -90,6 +94,10 @@ class RunDirectory:
             run = cls(path, settings)
             run._remove_partial()
             run.checkpoints.check(is_begun=(path / _METRICS).exists())
+            if (path / _ORIGINS).exists():
+                run._made = read_made(path / _ORIGINS)
+            elif run.checkpoints.exists():
+                run._made = [{**UNKNOWN, "stage": "earlier stages"}]
             run._read_metrics()
             yield run
 
@@ -107,6 +115,18 @@ class RunDirectory:
         if step > self._reported.get(stage, -1):
             line = json.dumps({"stage": stage, "step": step, **metrics})
             files.append(self.path / _METRICS, line)
+
+    def made(self, stage: str) -> list[Made]:
+        """What made each stage so far, and this process, which makes another."""
+        mine: Made = {**_process(), "stage": stage}
+        return self._made if mine in self._made else [*self._made, mine]
+
+    def _sign(self, checkpoint: str) -> None:
+        """Writes to `origins.json` that this process made a checkpoint."""
+        made = self.made(checkpoint.removeprefix("unfinished/").removeprefix("curves_"))
+        if made != self._made:
+            self._made = made
+            write_json(self.path / _ORIGINS, made)
 
     def _remove_partial(self) -> None:
         """Removes partial files of a killed process."""
@@ -221,7 +241,7 @@ def _locked(path: Path, field: str) -> Iterator[None]:
         yield
 
 
-def write_json(path: Path, content: Mapping[str, object]) -> None:
+def write_json(path: Path, content: Mapping[str, object] | Sequence[object]) -> None:
     """Writes a JSON file.
 
     Args:
@@ -237,11 +257,17 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 def origin() -> Origin:
     """How figures of this process are made."""
+    return {**_process(), "date": datetime.now().date().isoformat()}
+
+
+@functools.cache
+def _process() -> Origin:
+    """What is the same for all figures of this process."""
     found: Origin = {
         "versions": version.versions(),
         "devices": [device.device_kind for device in jax.devices()],
         "cores": devices.cores(),
-        "date": datetime.now().date().isoformat(),
+        "source": version.SOURCE,
     }
     return {**found, "commit": commit} if (commit := version.commit()) else found
 
@@ -278,6 +304,8 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         checkpoint, if the run names custom sensors without trust, or if JAX computes in 64 bits.
     """
     require_32_bits()
+    if not isinstance(path, str | Path):
+        raise ConfigError("run", path, "must be a path")
     path, given = Path(path), str(path)
     if given.startswith(PREFIX) and not path.exists():
         return load_pretrained(given.removeprefix(PREFIX))

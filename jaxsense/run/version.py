@@ -1,5 +1,6 @@
 """Versions of jaxsense, of Python and of the packages that results depend on."""
 
+import hashlib
 import importlib.metadata
 import platform
 import subprocess
@@ -8,6 +9,9 @@ from pathlib import Path
 __version__ = "0.4.0"
 """Version of jaxsense."""
 _ROOT = Path(__file__).parents[2]
+_FILES = sorted(Path(__file__).parents[1].rglob("*.py"))
+SOURCE = hashlib.sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()[:16]
+"""Digest of jaxsense, taken at import so that it matches the code that runs."""
 _PLACE = str(Path(__file__).relative_to(_ROOT))
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 

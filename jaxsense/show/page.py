@@ -1,13 +1,12 @@
 """The report of a run: one page that needs no other file."""
 
-import contextlib
 import json
 import operator
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from jaxsense.config import PRESETS, Config, as_plain, parse_json
+from jaxsense.config import PRESETS, Config, as_plain
 from jaxsense.show import html, tables
 from jaxsense.show.mission_plots import counted
 from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
@@ -37,7 +36,7 @@ def render(
     """
     here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.svg")
     elsewhere = [
-        _missions(_title(found), found["mission"], run / EVALUATIONS / f"{name}.svg")
+        _missions(_title(found, summary), found["mission"], run / EVALUATIONS / f"{name}.svg")
         for name, found in (evaluations or {}).items()
     ]
     return html.render(
@@ -46,7 +45,7 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.sensors else "",
         summary=summary,
-        remarks=compare.remarks(summary["preset"], summary["belief"]),
+        remarks=compare.remarks(summary),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],
         learned=[
@@ -57,8 +56,7 @@ def render(
         ],
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
-        devices=_counted(summary["devices"]),
-        commit=_commit(run),
+        counted=_counted,
         changed=_changed(config, summary["preset"]),
         config=json.dumps(as_plain(config), indent=2),
         plot=lambda name: _data(run / f"{name}.svg"),
@@ -99,11 +97,14 @@ def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
     }
 
 
-def _title(found: Evaluation) -> str:
+def _title(found: Evaluation, summary: Summary) -> str:
+    """What was evaluated, and with what where that is not what finished the run."""
     seeds = {case.get("seed", 0) for case in cases(found["mission"]).values()}
+    changed = compare.differences_of([summary, found.get("origin", compare.UNKNOWN)])
+    made = "".join(f"; {name} {value}" for name, (_, value) in changed.items())
     return (
         f"Evaluation: {found['num_pois']} PoIs in {found['side']:g} m; robots: "
-        f"{counted(found['robots'])}; seed {', '.join(map(str, sorted(seeds)))}"
+        f"{counted(found['robots'])}; seed {', '.join(map(str, sorted(seeds)))}{made}"
     )
 
 
@@ -115,14 +116,6 @@ def _data(path: Path) -> str | None:
     for each in (path, path.with_suffix(".png")):
         if each.exists():
             return html.picture(each.suffix[1:], each.read_bytes())
-    return None
-
-
-def _commit(run: Path) -> str | None:
-    """The commit in a run's `config.json`, if any."""
-    with contextlib.suppress(OSError, ValueError):
-        content = parse_json((run / "config.json").read_text(encoding="utf-8"))
-        return content.get("commit") if isinstance(content, dict) else None
     return None
 
 

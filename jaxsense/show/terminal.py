@@ -1,6 +1,6 @@
 """Shows the progress of a program."""
 
-import contextlib
+import io
 import time
 from collections.abc import Callable, Sequence
 
@@ -11,6 +11,7 @@ import rich.table
 import rich.text
 from rich.table import Column
 
+from jaxsense.run.output import say
 from jaxsense.show.tables import Table
 
 _LINE_PERIOD = 5.0  # s
@@ -128,17 +129,11 @@ class Display:
         say(f"{clock}: {progress}  {text}".rstrip())
 
 
-def say(text: str) -> None:
-    """Prints a line; ignores a closed output, which must not end a run."""
-    with contextlib.suppress(OSError):
-        print(text, flush=True)
-
-
-def print_table(console: rich.console.Console, table: Table) -> None:
-    """Prints a table; markup in cells is not interpreted.
+def as_text(console: rich.console.Console, table: Table) -> str:
+    """A table as a console shows it; markup in cells is not interpreted.
 
     Args:
-      console: to print it on.
+      console: on which it will be printed.
       table: the table.
     """
     drawn = rich.table.Table("", box=rich.box.SIMPLE, pad_edge=False, title_justify="left")
@@ -152,7 +147,11 @@ def print_table(console: rich.console.Console, table: Table) -> None:
         )
         drawn.add_row(rich.text.Text(name), *cells)
     if not console.is_terminal:
-        console = rich.console.Console(file=console.file, width=_ENDLESS, quiet=console.quiet)
-    console.print(drawn)
-    if table.note:
-        console.print(rich.text.Text(table.note))
+        # Even the nothing that it writes while it is captured fails on a full disk.
+        nowhere = io.TextIOWrapper(io.BytesIO(), getattr(console.file, "encoding", None))
+        console = rich.console.Console(file=nowhere, width=_ENDLESS)
+    with console.capture() as captured:
+        console.print(drawn)
+        if table.note:
+            console.print(rich.text.Text(table.note))
+    return captured.get().removesuffix("\n")

@@ -317,10 +317,17 @@ class Origin(TypedDict):
 
     versions: Annotated[dict[str, str], Metric("versions", "Versions of Python and of libraries.")]
     devices: Annotated[list[str], Metric("devices", "Kind of each accelerator, or `cpu`.")]
-    # Runs of earlier versions lack the next three; the last is only known in a checkout.
+    # Figures of earlier versions lack the next four; the last is only known in a checkout.
     cores: NotRequired[Annotated[int, Metric("cores", "CPU cores of the machine.", 0)]]
     date: NotRequired[Annotated[str, Metric("date", "Day on which the figures were finished.")]]
+    source: NotRequired[Annotated[str, Metric("source", "Digest of the code of jaxsense.")]]
     commit: NotRequired[Annotated[str, Metric("commit", "Commit of the source tree.")]]
+
+
+class Made(Origin):
+    """What made a stage of a run, or a part of it."""
+
+    stage: str
 
 
 class Evaluation(TypedDict):
@@ -329,7 +336,7 @@ class Evaluation(TypedDict):
     num_pois: Annotated[int, Metric("PoIs", "Number of points of interest.", 0)]
     side: Annotated[float, Metric("side [m]", "Side of the arena.", 2)]
     robots: Annotated[list[str], Metric("robots", "Modality of each robot.")]
-    # Those of earlier versions, and of several calls that were not made alike, lack it.
+    # Those of earlier versions may lack it.
     origin: NotRequired[Origin]
     mission: Missions
 
@@ -339,6 +346,9 @@ class Header(Origin):
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
+    origins: NotRequired[
+        Annotated[list[Made], Metric("origins", "Origins of the stages, if several.")]
+    ]
     seeds: NotRequired[
         Annotated[dict[str, Results], Metric("seeds", "Results of each of several seeds.")]
     ]

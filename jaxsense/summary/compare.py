@@ -1,6 +1,6 @@
 """Compares policies that played in the same arenas."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,8 @@ from jaxsense.summary.blocks import (
     Differences,
     Missions,
     OfNaive,
+    Origin,
+    Summary,
     cases,
     traffic,
 )
@@ -28,6 +30,10 @@ AS_ACCURATE = 0.005
 Measured = Mapping[str, PyTree[np.ndarray]]
 """`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
 
+UNKNOWN: Origin = {"versions": {}, "devices": []}
+"""Origin of figures that do not tell it."""
+
+_MADE_BY = ("devices", "cores", "source", "commit")
 _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
@@ -152,18 +158,45 @@ def unsound(block: Beliefs) -> str | None:
     )
 
 
-def remarks(preset: str, block: Beliefs) -> list[str]:
+def differences_of(origins: Sequence[Origin]) -> dict[str, list[str]]:
+    """Code, versions and machines in which origins differ, on whatever days.
+
+    Args:
+      origins: of some figures.
+
+    Returns:
+      By name, the value of each origin.
+    """
+    found = [
+        {**each["versions"], **{name: x for name, x in each.items() if name in _MADE_BY}}
+        for each in origins
+    ]
+    names = dict.fromkeys(name for each in found for name in each)
+    values = {name: [str(each.get(name, "unknown")) for each in found] for name in names}
+    return {name: each for name, each in values.items() if len(set(each)) > 1}
+
+
+def several_origins(origins: Sequence[Origin]) -> str | None:
+    """Says in what the origins of a run's stages differ; None if they do not."""
+    parts = [
+        f"{name} {' and '.join(dict.fromkeys(values))}"
+        for name, values in differences_of(origins).items()
+    ]
+    return f"Stages of this run were made with different {', '.join(parts)}." if parts else None
+
+
+def remarks(found: Summary) -> list[str]:
     """What to keep in mind about all results of a run.
 
     Args:
-      preset: its name.
-      block: `belief` of its summary.
+      found: its summary.
 
     Returns:
       Sentences. Where results are not meant to be good, none says how to improve them.
     """
-    found = _CAUTIONS.get(preset) or unsound(block)
-    return [found] if found else []
+    made = several_origins(found.get("origins", ()))
+    caution = _CAUTIONS.get(found["preset"]) or unsound(found["belief"])
+    return [each for each in (made, caution) if each]
 
 
 def detection_sizes(block: Missions) -> str:

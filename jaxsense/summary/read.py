@@ -9,7 +9,7 @@ from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError, parse_json
 from jaxsense.config.options import command
-from jaxsense.summary.blocks import Evaluation, Results, Summary
+from jaxsense.summary.blocks import Evaluation, Made, Results, Summary
 
 EVALUATIONS = "evaluations"
 """The directory of evaluations in that of a run."""
@@ -42,6 +42,18 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
     """
     files = sorted((run / EVALUATIONS).glob("*.json"))
     return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
+
+
+def read_made(file: Path) -> list[Made]:
+    """Reads what made each stage of a run.
+
+    Args:
+      file: its `origins.json`.
+
+    Raises:
+      ConfigError: if it cannot be read, or a value in it is missing or wrong.
+    """
+    return cast(list[Made], _read(file.parent, file, list[Made]))
 
 
 class NotFinishedError(ConfigError):

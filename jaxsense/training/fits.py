@@ -36,7 +36,7 @@ def fit_stage(
       settings: `config -> settings of the fit`.
       untrained: `(key, config, **inputs) -> (model, parameters to fit)`.
       problem: `(config, model, **inputs) -> Problem`.
-      trained: `(config, model, FitState, **inputs) -> output`; a run calls it after every chunk.
+      trained: `(config, model, FitState, **inputs) -> output`.
       is_optional: see `Stage`.
     """
     steps = settings(config).steps

@@ -99,12 +99,10 @@ def learn(
       except its missions.
 
     Raises:
-      TypeError: if `config` is no `Config`.
-      ValueError: if no stage has this name.
+      ValueError: if `config` is no `Config`, or no stage has this name.
     """
     checks.require_key(key)
-    if not isinstance(config, Config):
-        raise TypeError(f'config = {config!r}: must be a Config, such as jaxsense.PRESETS["smoke"]')
+    checks.require_type("config", config, Config, "all settings")
     found = stages(config, arena)
     names = [stage.name for stage in found]
     if until is not None and until not in names:

@@ -134,6 +134,23 @@ IS_TASK = "must be from make, or one of map-v0, many-v0, noisy-v0, team-v0"
 BAD = jnp.array([0, 1, 7])
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
+    "load none": (lambda w: jaxsense.load(None), "run = None: must be a path"),
+    "load number": (lambda w: jaxsense.load(3), "run = 3: must be a path"),
+    **{
+        f"{name} {config}": (
+            lambda w, call=call, config=config: call(w, config),
+            f"config = {config!r}: must be Config, all settings",
+        )
+        for name, call in {
+            "init": lambda w, config: jaxsense.init(w.key, config),
+            "learn": lambda w, config: jaxsense.learn(w.key, config),
+            "make_mdp": lambda w, config: jaxsense.make_mdp(config, w.models),
+            "make_jmvae": lambda w, config: jaxsense.make_jmvae(config),
+            "make_world": lambda w, config: sim.make_world(config),
+            "make_mission": lambda w, config: mission.make_mission(config),
+        }.items()
+        for config in (None, "smoke")
+    },
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
     "load preset": (
         lambda w: jaxsense.load("noisy"),

@@ -16,7 +16,7 @@ from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.mission import choice, decide
 from jaxsense.mission.state import DRIVING, FAILED
-from jaxsense.run import cli, pipeline, programs
+from jaxsense.run import output, pipeline, programs
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -185,7 +185,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
     argv = [*RUN, "--out", str(tmp_path / "run"), "--cache", str(tmp_path / "cache")]
     with pytest.raises(SystemExit) as stop:
         train.main(argv, policies=OWN)
-    assert stop.value.code == cli.INTERRUPTED
+    assert stop.value.code == output.INTERRUPTED
     assert given == [(("latent", "mine"), None, OWN)]
 
 

@@ -10,7 +10,7 @@ from jaxsense.summary import BLOCKS, metrics
 
 KEYS = {place + key for place, block in BLOCKS.items() for key in block}
 # Only in some runs: of several seeds, of a team, from scans, or of one robot alone.
-RARE = {"commit", "seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
+RARE = {"commit", "origins", "seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
 RARE |= {"jmvae.grouped.pair", "jmvae.grouped.all_looks"}
 RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
 RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
@@ -44,7 +44,7 @@ def test_every_rare_key_is_somewhere():
     alone = {**CASE, "seed": 7, "of_naive": of_naive, "told": 1.0, "ambiguous_reported": None}
     evaluation = {**EVALUATION, "mission": {"camera_alone": alone, "bytes_per_detection": BYTES}}
     found = keys(OF_SEEDS) | keys(OF_A_TEAM) | keys(OF_SCANS)
-    found |= {"commit"} | {
+    found |= {"commit", "origins"} | {
         key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)
     }
     assert RARE | OF_ALL_NAIVE <= found <= KEYS

@@ -158,9 +158,10 @@ def test_the_largest_loss_of_information_is_told():
 
 def test_no_remark_advises_where_results_are_not_meant_to_be_good():
     worse = {"looks": [1], "nll": [2.0], "bayes_nll": [0.5]}
-    (of_default,) = compare.remarks("default", worse)
+    (of_default,) = compare.remarks({"preset": "default", "belief": worse})
     assert of_default == compare.unsound(worse)
-    (of_smoke,) = compare.remarks("smoke", worse)
+    (of_smoke,) = compare.remarks({"preset": "smoke", "belief": worse})
     assert "only checks that everything runs" in of_smoke
     assert "Try" not in of_smoke
-    assert compare.remarks("default", {**worse, "nll": [0.5]}) == []
+    sound = {"preset": "default", "belief": {**worse, "nll": [0.5]}}
+    assert compare.remarks(sound) == []

@@ -1,0 +1,76 @@
+"""The standard streams of a command, which may be closed or full, and its exit status."""
+
+import atexit
+import contextlib
+import errno
+import gc
+import io
+import os
+import sys
+from collections.abc import Callable
+
+INTERRUPTED = 130
+"""Exit status, as in shells."""
+_RARELY = 100_000, 50, 50  # see `gc.set_threshold`
+
+
+def run(main: Callable[[], None]) -> None:
+    """Runs a command; ends the process if it exits, and without a traceback at Ctrl-C.
+
+    Args:
+      main: the command.
+    """
+    # Tracing makes and drops millions of small objects; by default, looking for circles among them
+    # takes a sixth of its time. Modules stay.
+    gc.freeze()
+    gc.set_threshold(*_RARELY)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The terminal may be unable to show the name of a directory.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    status = None
+    try:
+        main()
+    except KeyboardInterrupt:
+        complain("Interrupted.")
+        status = INTERRUPTED
+    except SystemExit as stop:
+        status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+        atexit._run_exitfuncs()
+    for name in ("stdout", "stderr"):
+        try:
+            print(end="", file=getattr(sys, name), flush=True)
+        except OSError:
+            setattr(sys, name, None)  # Python would fail at its end
+    if status is not None:
+        os._exit(status)  # any other exit would wait for compiling threads
+
+
+def tell(text: str) -> None:
+    """Prints the result of a command.
+
+    Args:
+      text: the result.
+
+    Raises:
+      SystemExit: with status 1, after a line to standard error, if it cannot be printed.
+    """
+    try:
+        if sys.stdout is None:  # closed before the process began
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        print(text, flush=True)
+    except OSError as error:
+        complain(f"jaxsense: standard output cannot be written ({error.strerror})")
+        sys.exit(1)
+
+
+def say(text: str) -> None:
+    """Prints a line about results that are in files; ignores output that cannot be written."""
+    with contextlib.suppress(OSError):
+        print(text, flush=True)
+
+
+def complain(text: str) -> None:
+    """Prints a line to standard error, if it is still open."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError):
+            print(text, file=sys.stderr, flush=True)
