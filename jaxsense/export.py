@@ -30,7 +30,6 @@ from jaxsense.models import Models
 from jaxsense.run import cli, files, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import resampling, sensors
-from jaxsense.sim.domain import Domain
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks.pretrained import PREFIX
 
@@ -103,7 +102,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
         "learned": {
-            name: _of_domain(domain)
+            name: {limit: np.nan_to_num(x).tolist() for limit, x in vars(domain).items()}
             for name, domain in zip(config.modalities, models.domains, strict=True)
         },
         "viewpoint": {
@@ -138,16 +137,6 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
         "frame (x ahead, y left), in radians, positive to the left; `height` is that of the rays "
         "above the floor, in metres; `window` is how wide a part of the scan the detector reads, "
         "in radians",
-    }
-
-
-def _of_domain(domain: Domain) -> dict[str, object]:
-    """Which looks a detector has learned from."""
-    limits = {name: np.asarray(x) for name, x in vars(domain).items()}
-    return {
-        **{name: x.tolist() for name, x in limits.items() if np.isfinite(x).all()},
-        "about": "lowest and highest of what the detector has learned: expected `distance`, in "
-        "metres; `bearing` and `step` from ray to ray, in radians; `range` of readings",
     }
 
 

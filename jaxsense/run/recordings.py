@@ -35,8 +35,7 @@ class RecordedLooks:
           name: of the sensor.
         """
         x, y = (self.positions - self.poses[name][:, :2]).T
-        turned = np.arctan2(y, x) - self.poses[name][:, 2]
-        bearing = (turned + np.pi) % (2 * np.pi) - np.pi
+        bearing = resampling.within_a_turn(np.arctan2(y, x) - self.poses[name][:, 2])
         return bearing.astype(np.float32), np.hypot(x, y).astype(np.float32)
 
 
@@ -96,17 +95,15 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
     if name in found and sensor.channels == 3 and found[name].dtype.kind in "iu":
         expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
         raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
-    if angles not in found:
-        others = f"; of other rays, {angles} must hold the angles, in radians"
-        _require_shape(found, name, ("C", len(sensor.angles), *channels), others)
-        _require_valid(found[name], sensor)
-        return _closed(sensor, sensor.angles, found[name])
-    _require_shape(found, angles, ("A",))
-    _require_shape(found, name, ("C", len(found[angles]), *channels))
+    rays, others = sensor.angles, f"; of other rays, {angles} must hold the angles, in radians"
+    if angles in found:
+        _require_shape(found, angles, ("A",))
+        rays, others = found[angles], ""
+        resampling.require_angles(f"angles of {sensor.name}", rays)
+    _require_shape(found, name, ("C", len(rays), *channels), others)
     _require_valid(found[name], sensor)
-    resampling.require_angles(f"angles of {sensor.name}", found[angles])
-    scans = _closed(sensor, found[angles], found[name])
-    return recorded.resample(sensor, found[angles], scans)
+    scans = _closed(sensor, rays, found[name])
+    return recorded.resample(sensor, rays, scans) if angles in found else scans
 
 
 def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray:

@@ -22,8 +22,8 @@ class Domain:
 
     Attributes:
       distance: `[2]` expected distance from the sensor to the PoI's centre, in metres.
-      bearing: `[2]` of the PoI in the robot's frame, in radians: that of viewpoints, and beyond it
-        as far as the window's rays lie around the PoI as they do there.
+      bearing: `[2]` of the PoI in the robot's frame, in radians: those of viewpoints, and others at
+        which the window's rays lie alike around the PoI.
       step: `[2]` angle between neighbouring rays that the detector reads, in radians.
       range: `[2]` `window_limit` of the sensor, twice.
     """
@@ -43,16 +43,10 @@ class Domain:
           bearing: of the PoI in the robot's frame, in radians; any turns.
           distance: expected distance of the PoI's centre, in metres.
         """
-        pairs = (
-            (distance, self.distance),
-            (windows.wrapped(bearing), self.bearing),
-            (jnp.asarray(sensor.steps), self.step),
-            (sensor.window_limit, self.range),
-        )
-        inside = [
-            jnp.all((x >= low - _ROUNDING) & (x <= high + _ROUNDING)) for x, (low, high) in pairs
-        ]
-        return jnp.stack(inside).all()
+        least, most = sensor.steps
+        look = jnp.stack([distance, windows.wrapped(bearing), least, most, sensor.window_limit])
+        low, high = jnp.stack([self.distance, self.bearing, self.step, self.step, self.range]).T
+        return jnp.all((look >= low - _ROUNDING) & (look <= high + _ROUNDING))
 
 
 def make_domain(config: Config, sensor: Sensor) -> Domain:
@@ -64,29 +58,18 @@ def make_domain(config: Config, sensor: Sensor) -> Domain:
     """
     view, errors = config.viewpoint, config.mission.localisation
     deviations = _DEVIATIONS * errors.in_training
-    either = jnp.array([-1.0, 1.0])
-    distances = jnp.stack([jnp.asarray(view.min_distance), jnp.asarray(view.max_distance)])
     off = view.max_bearing + view.bearing_error + deviations * errors.heading_error
+    drawn, either = jnp.radians(off), jnp.array([-1.0, 1.0])
+    angles, number = sensor.angles, len(sensor.angles)
+    # Evenly spaced rays lie alike around PoIs at all bearings, unless the window meets an end.
+    is_even = np.ptp(sensor.steps) < _ROUNDING
+    margin = (sensor.window - 1) * sensor.stride // 2 + 1 if is_even else number
+    inner = angles[margin : number - margin]
+    bearings = [jnp.min(inner, initial=-drawn), jnp.max(inner, initial=drawn)]
+    distances = [jnp.asarray(view.min_distance), jnp.asarray(view.max_distance)]
     return Domain(
-        distance=distances + deviations * errors.position_error * either,
-        bearing=_bearings(sensor, jnp.radians(off) * either),
-        step=jnp.asarray(sensor.steps),
+        distance=jnp.stack(distances) + deviations * errors.position_error * either,
+        bearing=jnp.clip(jnp.stack(bearings), angles.min(), angles.max()),
+        step=jnp.array(sensor.steps),
         range=jnp.full(2, sensor.window_limit),
     )
-
-
-def _bearings(sensor: Sensor, drawn: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Bearings in view at which a window's rays lie around the PoI as they do at drawn ones."""
-    angles, span = sensor.angles, (sensor.window - 1) * sensor.stride
-    starts = np.round(np.arange(len(angles)) - span / 2).astype(int)
-    starts = np.clip(starts, 0, len(angles) - 1 - span)
-    ends = angles[starts[:, None] + np.array([0, span])] - angles[:, None]
-    is_drawn = (angles >= drawn[0]) & (angles <= drawn[1])
-    low, high = (
-        reduce(ends, axis=0, where=is_drawn[:, None], initial=start)
-        for reduce, start in ((jnp.min, jnp.inf), (jnp.max, -jnp.inf))
-    )
-    is_known = ((ends >= low - _ROUNDING) & (ends <= high + _ROUNDING)).all(axis=1)
-    least = jnp.min(angles, where=is_known, initial=drawn[0])
-    most = jnp.max(angles, where=is_known, initial=drawn[1])
-    return jnp.clip(jnp.stack([least, most]), angles.min(), angles.max())
