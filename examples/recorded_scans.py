@@ -45,6 +45,10 @@ def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks)
             scan = looks.scans[sensor.name][n]
             search = config.mission.localisation.search
             detection = models.detect(m, sensor, scan, bearing, distance, search)
+            if not detection.is_known:
+                where = f"{distance:.2f} m away at {np.degrees(bearing):.0f} degrees"
+                print(f"  {sensor.name}: outside of what was recorded or learned, {where}")
+                continue
             if not detection.is_there:
                 print(f"  {sensor.name}: nothing there")
                 continue

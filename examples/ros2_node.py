@@ -338,8 +338,12 @@ class Robot:
         found = self.programs[f"detect_{self.name}"](
             readings=self._along_own_rays(scan), bearing=bearing, distance=distance
         )
+        where = f"PoI {self.target}, {distance:.2f} m away"
+        if not found["is_known"]:
+            self.notes.append(f"outside of what was recorded or learned: {where}")
+        elif not found["detects"]:
+            self.notes.append(f"nothing detected of {where}")
         if not found["detects"]:
-            self.notes.append(f"nothing detected of PoI {self.target}, {distance:.2f} m away")
             self.fail(scan.pose)
             return None
         look = {
@@ -437,12 +441,13 @@ class Robot:
 
     def _along_own_rays(self, scan: Scan) -> np.ndarray:
         """The scan along the rays that `detect` reads, without the gaps of single lost beams."""
-        measures_distance = scan.readings.ndim == 1
-        readings = scan.readings
+        own = np.array(self.contents["sensors"][self.name]["angles"])
+        measures_distance, readings = scan.readings.ndim == 1, scan.readings
         if measures_distance:
-            readings = self.resampling.close_gaps(scan.angles, readings)
+            step = self.resampling.median_step(own)
+            readings = self.resampling.close_gaps(scan.angles, readings, step=step)
         return self.resampling.resample(
-            np.array(self.contents["sensors"][self.name]["angles"]),
+            own,
             -scan.angles if self.is_upside_down else scan.angles,
             readings,
             measures_distance=measures_distance,

@@ -101,6 +101,10 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         },
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
+        "learned": {
+            name: {limit: np.nan_to_num(x).tolist() for limit, x in vars(domain).items()}
+            for name, domain in zip(config.modalities, models.domains, strict=True)
+        },
         "viewpoint": {
             "min_distance": float(viewpoint.min_distance),
             "max_distance": float(viewpoint.max_distance),

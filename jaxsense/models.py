@@ -18,6 +18,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.sim import search as searching
 from jaxsense.sim import sensors, windows
+from jaxsense.sim.domain import Domain, make_domain
 from jaxsense.sim.sensors import Sensor
 from jaxsense.vae import (
     detectors,
@@ -48,6 +49,7 @@ class Models:
 
     Attributes:
       detectors: one for each modality.
+      domains: for each modality, the looks that its detector has learned from.
       jmvae: parameters of the JMVAE.
       fusion: how looks update the map.
       bayes: the exact Bayes filter over classes, to compare with.
@@ -60,6 +62,7 @@ class Models:
     """
 
     detectors: tuple[Detector, ...]
+    domains: tuple[Domain, ...]
     jmvae: Params
     fusion: Fusion
     bayes: Bayes
@@ -80,15 +83,17 @@ class Models:
     ) -> Detection:
         """What a look says, from a whole scan.
 
-        It says that nothing is there if the window shows no PoI, if the bearing is outside the
-        field of view, or if a reading of the window is negative, NaN or an infinite brightness. A
-        distance that is infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
+        It says that nothing is there if the window shows no PoI. It is not known what is there if
+        distance, bearing or sensor are not as the detector has learned them, see `sim.Domain`, or
+        if a reading of the window is negative, NaN or a brightness above 1. A distance that is
+        infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
 
         Args:
           modality: index of the sensor; static.
           sensor: the sensor.
           readings: `[B, ...]` readings of all rays, see `sim.cut_out`.
-          bearing: bearing of the PoI in the robot's frame, in radians, positive to the left.
+          bearing: bearing of the PoI in the robot's frame, in radians, positive to the left; whole
+            turns do not matter.
           distance: distance at which the PoI's centre is expected, in metres.
           search: largest errors of the robot's pose, within which other bearings and distances are
             tried, too; static. By default none are.
@@ -100,6 +105,7 @@ class Models:
         channels = () if sensor.channels == 1 else (sensor.channels,)
         shape = (len(sensor.angles), *channels)
         checks.require_shape(f"readings of {sensor.name}", readings, shape)
+        bearing = windows.wrapped(jnp.asarray(bearing))
         of_window = windows.around(searching.widened(sensor, search), readings, bearing)
         return self.detect_in_window(modality, sensor, of_window, bearing, distance, search)
 
@@ -123,13 +129,11 @@ class Models:
           distance: of the PoI, see `detect`.
           search: see `detect`.
         """
-        most = jnp.inf if sensor.measures_distance else jnp.finfo(readings.dtype).max
-        is_valid = (readings >= 0) & (readings <= most)
-        wide = searching.widened(sensor, search)
-        window = windows.as_window(wide, jnp.where(is_valid, readings, jnp.nan))
-        # What is out of view is expected nowhere.
-        expected = jnp.where(windows.is_in_view(sensor, bearing), distance, jnp.nan)
-        detector = self.detectors[modality]
+        wide, bearing = searching.widened(sensor, search), windows.wrapped(bearing)
+        window = windows.as_window(wide, jnp.where(sensor.is_valid(readings), readings, jnp.nan))
+        detector, domain = self.detectors[modality], self.domains[modality]
+        # What has not been learned is expected nowhere.
+        expected = jnp.where(domain.contains(sensor, bearing, distance), distance, jnp.nan)
         if not search.applies:
             return detectors.answer(detector, window, expected)
         tried = searching.candidates(sensor, search, window, bearing, expected)
@@ -215,6 +219,11 @@ def make_bayes(config: Config) -> Bayes:
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
+def make_domains(config: Config) -> tuple[Domain, ...]:
+    """Makes for each modality the domain in which its detector learns."""
+    return tuple(make_domain(config, sensor) for sensor in sensors.make(config))
+
+
 def make_agent(config: Config) -> Agent:
     """Agent of `config.dqn.task`; a team's reads the reward of a useless look from the settings."""
     dqn, latent_size = config.dqn, config.jmvae.latent_size
@@ -279,6 +288,7 @@ def init(key: Key, config: Config) -> Models:
     }
     return Models(
         detectors=untrained,
+        domains=make_domains(config),
         jmvae=params,
         fusion=fusions[config.jmvae.fusion](),
         bayes=make_bayes(config),

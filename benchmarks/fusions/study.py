@@ -19,6 +19,7 @@ from jaxsense import (
     Models,
     learn,
     make_bayes,
+    make_domains,
     mission,
 )
 from jaxsense.config import PresetName
@@ -171,6 +172,7 @@ def _models(
 ) -> Models:
     return Models(
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
+        domains=make_domains(config),
         jmvae=outputs["best_jmvae"],
         fusion=fusion,
         bayes=make_bayes(config),

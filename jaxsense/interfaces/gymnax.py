@@ -21,8 +21,8 @@ with extra("gymnax"):
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
 
 
-@pytree
-class MapEnvState(environment.EnvState):  # pyright: ignore[reportGeneralTypeIssues]
+@pytree  # pyright: ignore[reportGeneralTypeIssues]
+class MapEnvState(environment.EnvState):
     """State of `MapEnv`.
 
     Attributes:
@@ -35,8 +35,8 @@ class MapEnvState(environment.EnvState):  # pyright: ignore[reportGeneralTypeIss
     terminated: jax.Array
 
 
-@pytree
-class MapEnvParams(environment.EnvParams):  # pyright: ignore[reportGeneralTypeIssues]
+@pytree  # pyright: ignore[reportGeneralTypeIssues]
+class MapEnvParams(environment.EnvParams):
     """Parameters of `MapEnv`: length of episodes, and prepared starts.
 
     Attributes:

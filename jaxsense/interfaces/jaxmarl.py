@@ -20,8 +20,8 @@ with extra("jaxmarl"), quietly():
     from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]
 
 
-@pytree
-class TeamEnvState(multi_agent_env.State):  # pyright: ignore[reportGeneralTypeIssues]
+@pytree  # pyright: ignore[reportGeneralTypeIssues]
+class TeamEnvState(multi_agent_env.State):
     """State of `TeamEnv`.
 
     Attributes:

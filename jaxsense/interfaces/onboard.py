@@ -85,6 +85,7 @@ def _detect(config: Config, m: int) -> Function:
         found = models.detect(m, sensor, readings, bearing, distance, search)
         is_confident = jnp.max(found.features) >= least
         return {
+            "is_known": found.is_known,
             "is_there": found.is_there,
             "detects": found.is_there & is_confident,
             "features": found.features,
@@ -106,6 +107,9 @@ def _detect(config: Config, m: int) -> Function:
         "distance": Input((), "expected from the sensor to the PoI's centre, in metres"),
     }
     outputs = {
+        "is_known": "whether the detector has learned from looks like this one, see `learned`, and "
+        "the scan was recorded around the bearing; if not, it says neither that the PoI is there "
+        "nor that it is not",
         "is_there": "whether the scan shows the PoI",
         "detects": f"whether it is there and a label has a probability of at least {float(least):g}"
         ": only then write the look",

@@ -35,8 +35,7 @@ class RecordedLooks:
           name: of the sensor.
         """
         x, y = (self.positions - self.poses[name][:, :2]).T
-        turned = np.arctan2(y, x) - self.poses[name][:, 2]
-        bearing = (turned + np.pi) % (2 * np.pi) - np.pi
+        bearing = resampling.within_a_turn(np.arctan2(y, x) - self.poses[name][:, 2])
         return bearing.astype(np.float32), np.hypot(x, y).astype(np.float32)
 
 
@@ -96,35 +95,34 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
     if name in found and sensor.channels == 3 and found[name].dtype.kind in "iu":
         expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
         raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
-    if angles not in found:
-        others = f"; of other rays, {angles} must hold the angles, in radians"
-        _require_shape(found, name, ("C", len(sensor.angles), *channels), others)
-        _require_not_negative(found[name], sensor)
-        return _closed(sensor, sensor.angles, found[name])
-    _require_shape(found, angles, ("A",))
-    _require_shape(found, name, ("C", len(found[angles]), *channels))
-    _require_not_negative(found[name], sensor)
-    resampling.require_angles(f"angles of {sensor.name}", found[angles])
-    scans = _closed(sensor, found[angles], found[name])
-    return recorded.resample(sensor, found[angles], scans)
+    rays, others = sensor.angles, f"; of other rays, {angles} must hold the angles, in radians"
+    if angles in found:
+        _require_shape(found, angles, ("A",))
+        rays, others = found[angles], ""
+        resampling.require_angles(f"angles of {sensor.name}", rays)
+    _require_shape(found, name, ("C", len(rays), *channels), others)
+    _require_valid(found[name], sensor)
+    scans = _closed(sensor, rays, found[name])
+    return recorded.resample(sensor, rays, scans) if angles in found else scans
 
 
 def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray:
     """Scans without the gaps of lost beams, as robots read them."""
     if not sensor.measures_distance:
         return scans
-    closed = [resampling.close_gaps(angles, scan) for scan in scans]
+    closed = [resampling.close_gaps(angles, scan, step=sensor.steps[1]) for scan in scans]
     found = np.array(closed, np.float32).reshape(scans.shape)
     return np.where(np.isnan(scans), np.float32(np.nan), found)
 
 
-def _require_not_negative(scans: np.ndarray, sensor: Sensor) -> None:
-    """Raises `ValueError` if a reading is negative."""
-    is_negative = scans < 0
-    if is_negative.any():
+def _require_valid(scans: np.ndarray, sensor: Sensor) -> None:
+    """Raises `ValueError` if a reading is negative, or a brightness above 1."""
+    is_wrong = ~np.asarray(sensor.is_valid(scans.astype(np.float32))) & ~np.isnan(scans)
+    if is_wrong.any():
         returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
-        found = f"{sensor.name}_scans holds {scans[is_negative][0]:g}"
-        raise ValueError(f"{found}; must be at least 0{returns}")
+        most = " and at most 1, linear RGB" if sensor.channels == 3 else ""
+        found = f"{sensor.name}_scans holds {scans[is_wrong][0]:g}"
+        raise ValueError(f"{found}; must be at least 0{returns or most}")
 
 
 def _require_shape(

@@ -45,7 +45,8 @@ def resample(
         expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
         raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
     window = _require_dense(sensor, angles)
-    recorded = _longest(resampling.covered(sensor.angles, angles))
+    _, step = sensor.steps
+    recorded = _longest(resampling.covered(sensor.angles, angles, step))
     if len(recorded) < window:
         needed, found = (
             np.degrees(np.ptp(angles)) if len(angles) else 0.0
@@ -59,6 +60,7 @@ def resample(
         angles,
         np.moveaxis(readings, 1, 0),
         measures_distance=sensor.measures_distance,
+        step=step,
     )
     return np.moveaxis(found, 0, 1)
 
@@ -68,11 +70,9 @@ def _require_dense(sensor: Sensor, angles: Float[np.ndarray, " A"]) -> int:
 
     Raises `ValueError` if there are too few recorded rays, or they are too far apart.
     """
-    own = np.abs(np.diff(sensor.angles)).max() * sensor.stride
-    most = np.degrees(resampling.MAX_STEPS * own)
-    step = resampling.median_step(angles)
-    if step > resampling.MAX_STEPS * own:
-        expected = f"must be at most {most:.2f} degrees"
+    most, step = resampling.MAX_STEPS * sensor.steps[1], resampling.median_step(angles)
+    if step > most:
+        expected = f"must be at most {np.degrees(most):.2f} degrees"
         raise ValueError(
             f"step between the rays of {sensor.name} = {np.degrees(step):.2f} degrees: {expected}"
         )

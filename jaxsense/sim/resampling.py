@@ -6,8 +6,10 @@
 import numpy as np
 
 _TURN = 2 * np.pi + 1e-3  # rad; drivers round the last angle
+_ROUNDING = 1e-6  # rad
 MAX_STEPS = 3.0
-"""A gap between two rays of more than this many median steps was not recorded."""
+"""A gap between two recorded rays of more than this many steps of the rays that are read was not
+recorded."""
 MAX_LOST = 5
 """Beams in a row that may have been lost; where more have no return, nothing is near."""
 SURFACE = 0.1
@@ -15,13 +17,19 @@ SURFACE = 0.1
 
 
 def resample(
-    targets: np.ndarray, angles: np.ndarray, readings: np.ndarray, *, measures_distance: bool
+    targets: np.ndarray,
+    angles: np.ndarray,
+    readings: np.ndarray,
+    *,
+    measures_distance: bool,
+    step: float | None = None,
 ) -> np.ndarray:
     """Readings along other rays.
 
     Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
     the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
-    full circle has the first as its neighbour.
+    full circle has the first as its neighbour. Recorded rays need not be evenly spaced, as those
+    of several sweeps are not.
 
     Args:
       targets: `[B]` directions of the rays to read along, in radians.
@@ -29,9 +37,10 @@ def resample(
         or more.
       readings: `[A, ...]` recorded distances in metres, or other readings of these rays.
       measures_distance: whether readings are distances.
+      step: see `covered`.
 
     Returns:
-      `[B, ...]` readings along `targets`, NaN outside the recorded field of view.
+      `[B, ...]` readings along `targets`, NaN where nothing was recorded, see `covered`.
 
     Raises:
       ValueError: if angles are not finite or beyond a turn, or readings are not one for each.
@@ -42,7 +51,7 @@ def resample(
     if np.shape(readings)[:1] != np.shape(angles):
         expected = f"must be one for each of {np.size(angles)} angles"
         raise ValueError(f"readings have the shape {np.shape(readings)}: {expected}")
-    right, left, share, is_between = _neighbours(targets, angles)
+    right, left, share, is_between, is_covered = _neighbours(targets, angles, step)
     readings = with_returns(readings) if measures_distance else np.asarray(readings, np.float32)
     first, second = readings[right], readings[left]
     # One number for each ray, next to readings of any shape.
@@ -53,7 +62,7 @@ def resample(
         is_same = np.abs(second - first) < SURFACE if measures_distance else True
     nearest = np.where(share < 0.5, first, second)
     found = np.where(is_between & is_same, between, nearest).astype(np.float32)
-    found[~covered(targets, angles)] = np.nan
+    found[~is_covered] = np.nan
     return found
 
 
@@ -63,7 +72,9 @@ def with_returns(ranges: np.ndarray) -> np.ndarray:
     return np.where(ranges == 0, np.float32(np.inf), ranges)
 
 
-def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> np.ndarray:
+def close_gaps(
+    angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST, step: float | None = None
+) -> np.ndarray:
     """Distances in which beams that were lost take those of their neighbours.
 
     Where up to `most` beams in a row have no return and those on both sides have one, each takes
@@ -75,6 +86,8 @@ def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> 
       angles: `[A]` directions of the beams, in radians, in any order.
       ranges: `[A]` distances in metres; 0, infinite or NaN without a return.
       most: beams in a gap.
+      step: angle between the rays that are read later, in radians: what was not recorded is wider
+        than `MAX_STEPS` of them. By default the median one between beams, for evenly spaced ones.
 
     Returns:
       `[A]` float32.
@@ -93,7 +106,8 @@ def close_gaps(angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST) -> 
     beams = np.tile(order, 3)
     along = turned[beams] + np.repeat([-2 * np.pi, 0.0, 2 * np.pi], len(order))
     # What was not recorded separates beams.
-    part = np.cumsum(np.diff(along, prepend=along[:1]) >= MAX_STEPS * median_step(angles))
+    step = median_step(angles) if step is None else step
+    part = np.cumsum(np.diff(along, prepend=along[:1]) > _widest(step))
     is_lost = (np.isnan(ranges) | (ranges == np.inf))[beams]
     known, here = np.flatnonzero(~is_lost), np.arange(len(beams))
     if not len(known):
@@ -126,19 +140,20 @@ def require_angles(name: str, angles: np.ndarray) -> None:
         raise ValueError(f"{name} = {wrong[0]:g}: {expected}")
 
 
-def covered(targets: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def covered(targets: np.ndarray, angles: np.ndarray, step: float | None = None) -> np.ndarray:
     """Which of some rays lie in the recorded field of view.
 
     Args:
       targets: `[B]` directions of these rays, in radians.
       angles: `[A]` directions of the recorded rays, in radians, in any order; two or more.
+      step: angle between the rays that are read, in radians; by default the median one of
+        `targets`.
 
     Returns:
-      `[B]` bool: between two recorded rays, or within half a step of one.
+      `[B]` bool: between two recorded rays no farther apart than `MAX_STEPS` steps, or within half
+      a step of one.
     """
-    *rays, _, is_between = _neighbours(targets, angles)
-    apart = [np.abs(within_a_turn(targets - np.asarray(angles)[ray])) for ray in rays]
-    return is_between | (np.minimum(*apart) < median_step(angles) / 2)
+    return _neighbours(targets, angles, step)[-1]
 
 
 def median_step(angles: np.ndarray) -> float:
@@ -147,8 +162,13 @@ def median_step(angles: np.ndarray) -> float:
     Args:
       angles: directions of the rays, in radians, in any order.
     """
-    turned = np.unique(within_a_turn(angles))
-    return float(np.median(np.diff(turned))) if len(turned) > 1 else np.inf
+    steps = np.diff(np.unique(within_a_turn(angles)))
+    return float(np.median(steps)) if len(steps) else np.inf
+
+
+def _widest(step: float) -> float:
+    """Widest gap between recorded rays that is none, in radians."""
+    return MAX_STEPS * step + _ROUNDING
 
 
 def within_a_turn(angles: np.ndarray) -> np.ndarray:
@@ -157,13 +177,15 @@ def within_a_turn(angles: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(
-    targets: np.ndarray, angles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    targets: np.ndarray, angles: np.ndarray, step: float | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Recorded rays to the right and to the left of each target.
 
-    Returns their indices; how far the target is from one to the other, from 0 to 1; and whether
-    what lies between them was recorded.
+    Returns their indices; how far the target is from one to the other, from 0 to 1; whether what
+    lies between them was recorded; and whether the target was, see `covered`.
     """
+    if step is None:
+        step = median_step(targets if np.size(targets) > 1 else angles)
     turned, order = np.unique(within_a_turn(angles), return_index=True)
     # The last ray also comes before the first one, and this after the last.
     circle = np.concatenate([turned[-1:] - 2 * np.pi, turned, turned[:1] + 2 * np.pi])
@@ -172,4 +194,6 @@ def _neighbours(
     right = np.searchsorted(circle, targets, side="right") - 1
     gap = circle[right + 1] - circle[right]
     share = (targets - circle[right]) / gap
-    return order[right], order[right + 1], share, gap < MAX_STEPS * median_step(angles)
+    is_between = gap <= _widest(step)
+    is_covered = is_between | (np.minimum(share, 1 - share) * gap < step / 2)
+    return order[right], order[right + 1], share, is_between, is_covered

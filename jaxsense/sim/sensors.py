@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
@@ -25,6 +25,7 @@ from jaxsense.sim.light import Light
 from jaxsense.sim.rays import Fan, Pinhole, Rays
 
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
+_ROUNDING = 1e-4  # of a brightness
 
 Surfaces = dict[str, jax.Array]
 """Surfaces of G geoms: `colour`, the `[G, 3]` albedo, and the `[G]` values of each of
@@ -96,6 +97,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         rays = windows.reshape(*windows.shape[:-1], self.window, self.channels)
         return rays if self.angles[0] > self.angles[-1] else rays[..., ::-1, :]
 
+    def is_valid(self, readings: Float[Array, "*axes"]) -> Bool[Array, "*axes"]:
+        """Tells which readings the sensor can make; a beam without a return is infinitely long."""
+        most = jnp.inf if self.measures_distance else jnp.finfo(readings.dtype).max
+        return (readings >= 0) & (readings <= most)
+
     @property
     def reads_conditions(self) -> bool:
         """Whether `read` needs `light.conditions`; by default not, and they may not be drawn."""
@@ -119,6 +125,15 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     def field_of_view(self) -> float:
         """Angle between the outermost rays, in degrees."""
         return float(np.degrees(np.ptp(self.angles)))
+
+    @property
+    def steps(self) -> tuple[float, float]:
+        """Smallest and largest angle between neighbouring rays that a detector reads, in radians.
+
+        Both are 0 if it reads one ray.
+        """
+        found = np.abs(np.diff(self.angles[:: self.stride]))
+        return (float(found.min()), float(found.max())) if found.size else (0.0, 0.0)
 
     @property
     def directions(self) -> Float[np.ndarray, "2 B"]:
@@ -157,6 +172,10 @@ class Camera(Sensor):
     """
 
     config: CameraConfig
+
+    def is_valid(self, readings: Float[Array, "*axes"]) -> Bool[Array, "*axes"]:
+        """See `Sensor.is_valid`."""
+        return (readings >= 0) & (readings <= 1 + _ROUNDING)
 
     def read(
         self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light

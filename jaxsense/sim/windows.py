@@ -91,6 +91,15 @@ def around(
     return jnp.asarray(readings, jnp.float32)[rays]
 
 
+def wrapped(bearing: Float[Array, ""]) -> Float[Array, ""]:
+    """The bearing without whole turns, from -pi to pi; one that is there stays as it is.
+
+    Args:
+      bearing: in radians.
+    """
+    return bearing - 2 * jnp.pi * jnp.round(bearing / (2 * jnp.pi))
+
+
 def is_in_view(sensor: Sensor, bearing: Float[Array, ""]) -> Bool[Array, ""]:
     """Tells whether a bearing is within the sensor's field of view.
 

@@ -30,6 +30,7 @@ def models_of(
     """
     return Models(
         detectors=(),
+        domains=(),
         jmvae={},
         fusion=fusion,
         bayes=make_bayes(config),

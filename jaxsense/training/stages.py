@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.models import Models, make_agent, make_bayes, make_domains
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import (
@@ -119,6 +119,7 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
     """
     return Models(
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
+        domains=make_domains(config),
         jmvae=outputs["best_jmvae"],
         fusion=outputs["fusion"],
         bayes=make_bayes(config),

@@ -97,10 +97,13 @@ class Detection:
     """Result of a look: whether the PoI is there, and its features.
 
     Attributes:
-      is_there: `[]` whether the window shows its PoI.
+      is_known: `[]` whether the detector can judge the look: all readings of a window are there,
+        and, from `Models.detect`, it has learned from looks like this one, see `sim.Domain`.
+      is_there: `[]` whether the window shows its PoI; False of a look that is not known.
       features: `[D_m]` probabilities of the labels, all equal if it does not.
     """
 
+    is_known: Bool[Array, ""]
     is_there: Bool[Array, ""]
     features: Float[Array, " D_m"]
 
@@ -138,9 +141,10 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
       window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
       distance: expected distance of the PoI's centre, in metres.
     """
+    is_known = gates.is_valid(window, distance)
     is_there = gates.passes(detector.gate, window, distance)
     features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
-    return Detection(is_there, features)
+    return Detection(is_known, is_there, features)
 
 
 def search(
@@ -173,11 +177,12 @@ def search(
     )
     prior = jax.nn.log_softmax(jnp.where(may_be, log_prior, _NEVER).reshape(-1))
     odds = jnp.where(may_be.reshape(-1), found.reshape(-1) + prior, _NEVER)
-    is_there = jnp.any(may_be) & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
+    is_known = jnp.any(may_be)
+    is_there = is_known & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
     share = jax.nn.softmax(odds).reshape(may_be.shape).sum(axis=0)
     logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
     pooled = jax.nn.softmax(product(share, logs))
-    return Detection(is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
+    return Detection(is_known, is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
 
 
 def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:

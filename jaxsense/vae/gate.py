@@ -73,6 +73,17 @@ def logits(
     return networks.apply(_NETWORK, gate.params, jnp.concatenate([read, expected]))[0]
 
 
+def is_valid(window: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
+    """Tells whether all readings of a window, and its distance, are such that a gate can judge it.
+
+    Args:
+      window: see `passes`.
+      distance: see `passes`.
+    """
+    checks.require_shape("distance", distance, ())
+    return jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
+
+
 def passes(gate: Gate, window: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
     """Tells whether a window shows its PoI.
 
@@ -84,9 +95,7 @@ def passes(gate: Gate, window: Float[Array, " F"], distance: Float[Array, ""]) -
     Returns:
       False if it shows something else, or a number is not finite or the distance not above 0.
     """
-    checks.require_shape("distance", distance, ())
-    is_valid = jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
-    return is_valid & (logits(gate, window, distance) >= gate.threshold)
+    return is_valid(window, distance) & (logits(gate, window, distance) >= gate.threshold)
 
 
 @pytree

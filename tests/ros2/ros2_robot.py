@@ -25,7 +25,7 @@ class Stub:
     """Programs that remember what they were asked; chooses PoIs in order, and detects."""
 
     def __init__(self):
-        self.detects, self.asked, self.choices = True, [], [0, 1, 2, 3]
+        self.is_known, self.detects, self.asked, self.choices = True, True, [], [0, 1, 2, 3]
 
     def programs(self):
         writes = {f"write_{name}": self.write for name in CONTENTS["robots"]}
@@ -41,7 +41,8 @@ class Stub:
 
     def detect(self, **given):
         self.asked.append(given)
-        return {"detects": self.detects, "features": np.array([0.75, 0.25])}
+        detects = self.detects and self.is_known
+        return {"is_known": self.is_known, "detects": detects, "features": np.array([0.75, 0.25])}
 
     def weigh(self, apart):
         return {"weight": 0.0 if (apart < 0.5).any() else 1.0}

@@ -107,7 +107,7 @@ def test_a_coarse_scan_gets_one_line_and_no_goal(ros2, robot, node, monkeypatch)
 
 def test_the_node_logs_what_goes_wrong_and_says_what_stands_where(ros2, robot, stub, node):
     stub.detects, goal = False, arrive(robot)
-    for _ in range(3):
+    for stub.is_known in (True, False, True):
         assert see(ros2, robot, goal) is None
         goal = arrive(robot, goal)
     stub.choices = [3]
@@ -117,6 +117,7 @@ def test_the_node_logs_what_goes_wrong_and_says_what_stands_where(ros2, robot, s
     logged = [call.args[0] for call in node.get_logger().info.call_args_list]
     assert logged[0] == "nothing detected of PoI 0, 0.90 m away"
     assert logged[1] == "failure 1 of 3 at PoI 0"
+    assert logged[2] == "outside of what was recorded or learned: PoI 0, 0.90 m away"
     assert logged[-2:] == ["gives PoI 0 up", "done: no further look is worth its cost"]
     assert robot.notes == []
     tell = ros2.join(node, robot, lambda: 1.0)

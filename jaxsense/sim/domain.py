@@ -1,0 +1,75 @@
+"""The domain of a detector: the looks that it has learned from.
+
+Elsewhere it may be certain and wrong.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxsense.config import Config
+from jaxsense.core.types import pytree
+from jaxsense.sim import windows
+from jaxsense.sim.sensors import Sensor
+
+_ROUNDING = 1e-5
+_DEVIATIONS = 3.0  # of a robot's pose in training
+
+
+@pytree
+class Domain:
+    """Limits, lowest and highest, of the looks that a detector has learned from.
+
+    Attributes:
+      distance: `[2]` expected distance from the sensor to the PoI's centre, in metres.
+      bearing: `[2]` of the PoI in the robot's frame, in radians: those of viewpoints, and others at
+        which the window's rays lie alike around the PoI.
+      step: `[2]` angle between neighbouring rays that the detector reads, in radians.
+      range: `[2]` `window_limit` of the sensor, twice.
+    """
+
+    distance: Float[Array, "2"]
+    bearing: Float[Array, "2"]
+    step: Float[Array, "2"]
+    range: Float[Array, "2"]
+
+    def contains(
+        self, sensor: Sensor, bearing: Float[Array, ""], distance: Float[Array, ""]
+    ) -> Bool[Array, ""]:
+        """Tells whether a look is one of those that the detector has learned from.
+
+        Args:
+          sensor: the sensor that looks.
+          bearing: of the PoI in the robot's frame, in radians; any turns.
+          distance: expected distance of the PoI's centre, in metres.
+        """
+        least, most = sensor.steps
+        look = jnp.stack([distance, windows.wrapped(bearing), least, most, sensor.window_limit])
+        low, high = jnp.stack([self.distance, self.bearing, self.step, self.step, self.range]).T
+        return jnp.all((look >= low - _ROUNDING) & (look <= high + _ROUNDING))
+
+
+def make_domain(config: Config, sensor: Sensor) -> Domain:
+    """Makes the domain of the detector that a training with these settings gives a sensor.
+
+    Args:
+      config: all settings.
+      sensor: one of `sensors.make(config)`.
+    """
+    view, errors = config.viewpoint, config.mission.localisation
+    deviations = _DEVIATIONS * errors.in_training
+    off = view.max_bearing + view.bearing_error + deviations * errors.heading_error
+    drawn, either = jnp.radians(off), jnp.array([-1.0, 1.0])
+    angles, number = sensor.angles, len(sensor.angles)
+    # Evenly spaced rays lie alike around PoIs at all bearings, unless the window meets an end.
+    is_even = np.ptp(sensor.steps) < _ROUNDING
+    margin = (sensor.window - 1) * sensor.stride // 2 + 1 if is_even else number
+    inner = angles[margin : number - margin]
+    bearings = [jnp.min(inner, initial=-drawn), jnp.max(inner, initial=drawn)]
+    distances = [jnp.asarray(view.min_distance), jnp.asarray(view.max_distance)]
+    return Domain(
+        distance=jnp.stack(distances) + deviations * errors.position_error * either,
+        bearing=jnp.clip(jnp.stack(bearings), angles.min(), angles.max()),
+        step=jnp.array(sensor.steps),
+        range=jnp.full(2, sensor.window_limit),
+    )
