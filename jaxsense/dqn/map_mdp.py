@@ -274,7 +274,7 @@ def step(
       if the gain is NaN or a traced action does not exist.
 
     Raises:
-      ValueError: if there is no such modality or action.
+      ValueError: if there is no such modality or action, or if the reward is not one number.
     """
     checks.require_key(key)
     _check_step(mdp, state, action, modality)
@@ -288,6 +288,7 @@ def step(
 
     new, scene = call(look, modality, mdp.num_modalities)
     of_look = mdp.reward.of_gain(mdp.information(new) - mdp.information(old))
+    checks.require_shape("reward of a look", of_look, ())
     exists = (action >= 0) & (action <= mdp.num_pois)
 
     looked = dataclasses.replace(

@@ -233,6 +233,7 @@ def value_iteration(
         return reward.information(mixture(probabilities), probabilities)
 
     before = jax.vmap(information)(points)
+    checks.require_shape("reward.information of all points", before, (len(points),))
     before = before.at[-1].set(reward.information(prior, points[-1]))
 
     def looks(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -46,15 +46,17 @@ def add(replay: Replay, transitions: Transition) -> Replay:
 
     Args:
       replay: the memory.
-      transitions: `[S, E]` states, `[E]` other fields.
+      transitions: `[S, E]` states, `[E]` other fields; stored as float32.
     """
     rounds, blocks, rows, width = replay.columns.shape
     checks.require_shape("transitions.s_tm1", transitions.s_tm1, ((rows - 3) // 2, blocks * width))
     checks.require_shape("transitions.s_t", transitions.s_t, transitions.s_tm1.shape)
     for name in ("a_tm1", "r_t", "discount_t"):
         checks.require_shape(f"transitions.{name}", getattr(transitions, name), (blocks * width,))
-    scalars = transitions.a_tm1, transitions.r_t, transitions.discount_t
-    columns = jnp.concatenate([transitions.s_tm1, transitions.s_t, jnp.stack(scalars)])
+    # Actions beyond 256 have no name in 16 bits.
+    given = jax.tree.map(lambda x: x.astype(replay.columns.dtype), transitions)
+    scalars = jnp.stack([given.a_tm1, given.r_t, given.discount_t])
+    columns = jnp.concatenate([given.s_tm1, given.s_t, scalars])
     in_blocks = jnp.moveaxis(columns.reshape(rows, blocks, width), 1, 0)
     place = replay.count % rounds
     ring = jax.lax.dynamic_update_index_in_dim(replay.columns, in_blocks, place, 0)
@@ -73,8 +75,13 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
 
     Returns:
       `[S, B * W]` states, and `[B * W]` other fields.
+
+    Raises:
+      ValueError: if the draws are not such numbers, or have 16 bits; or if the memory is empty.
     """
     checks.require_shape("draws", draws, (None, 2))
+    if draws.dtype.itemsize < 4:
+        raise ValueError(f"draws of dtype {draws.dtype}: must be float32, to reach every round")
     checks.require("draws", draws, lambda x: (x >= 0) & (x < 1), "must be from 0 to below 1")
     checks.require("rounds in replay", replay.count, lambda x: x > 0, "must be 1 or more; add some")
     rounds, blocks, rows, width = replay.columns.shape

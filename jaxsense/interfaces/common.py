@@ -1,6 +1,7 @@
 """Spaces and starts, shared by the interfaces."""
 
 import enum
+import os
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
@@ -30,6 +31,24 @@ class Spaces(Protocol[B_co, D_co]):
     def Discrete(self) -> Callable[..., D_co]:  # noqa: N802
         """Of a number of actions."""
         ...
+
+
+_processes: set[int] = set()  # in which environments were made: this one and those it forked from
+
+
+def enter_process() -> None:
+    """Notes that an environment was made in this process."""
+    _processes.add(os.getpid())
+
+
+def require_own_process() -> None:
+    """Raises `RuntimeError` if this process was forked from one that has made an environment.
+
+    Programs of JAX hang there.
+    """
+    if _processes - {os.getpid()}:
+        advice = "start processes with spawn, as vector_kwargs={'context': 'spawn'} does"
+        raise RuntimeError(f"this process was forked from one that uses JAX: {advice}")
 
 
 def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:

@@ -60,6 +60,7 @@ class TaskEnv(Env):
         """
         self.render_mode = common.checked_mode(render_mode, self.metadata["render_modes"])
         self.task = as_task(task, agent)
+        common.enter_process()
         self.observation_space, self.action_space = common.environment_spaces(spaces, self.task)
         self._key: Key | None = None
         self._state: PyTree = None
@@ -80,6 +81,7 @@ class TaskEnv(Env):
           `[S]` float32 observation, and infos.
         """
         del options
+        common.require_own_process()
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = _key(self)
@@ -174,6 +176,7 @@ class MapVectorEnv(VectorEnv):
           ValueError: if there is no such sensor or mode, or no environment.
         """
         played = common.environment(mdp, modality)
+        common.enter_process()
         checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
         self._task: Task | None = played if isinstance(played, MapTask | TeamTask) else None
@@ -208,6 +211,7 @@ class MapVectorEnv(VectorEnv):
         Raises:
           ValueError: if `reset_mask` does not hold a boolean for each environment.
         """
+        common.require_own_process()
         super().reset(seed=seed)
         if seed is not None or self._states is None:
             self._key = _key(self)

@@ -179,8 +179,10 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return common.environment_spaces(spaces, self.played)[0]
 
 
+# gymnax makes environments static: two of the same task would compile everything twice.
+@functools.cache
 def make_env(name: str, agent: str | None = None) -> MapEnv:
-    """Makes the environment of a task, see `jaxsense.make`.
+    """Makes the environment of a task, see `jaxsense.make`; the same one in every call.
 
     Args:
       name: of the task.

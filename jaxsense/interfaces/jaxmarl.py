@@ -124,8 +124,9 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         return classes
 
 
+@functools.cache  # jaxmarl makes environments static, see `TeamEnv`
 def make(name: str) -> TeamEnv:
-    """Makes the environment of a task, see `jaxsense.make`.
+    """Makes the environment of a task, see `jaxsense.make`; the same one in every call.
 
     Args:
       name: of the task.

@@ -13,7 +13,7 @@ from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.interfaces import team
+from jaxsense.interfaces import common, team
 from jaxsense.interfaces.extras import extra
 from jaxsense.interfaces.team import Robots, TeamOutcome
 from jaxsense.tasks.task import TeamTask
@@ -41,6 +41,7 @@ class _Team:
           ValueError: if the MDP has other sensors than the settings.
         """
         self._robots = team.robots_of(mdp, config)
+        common.enter_process()
         self.metadata = {"name": "jaxsense_team_v0", "render_modes": []}
         self.render_mode = None
         self.possible_agents = list(self._robots.names)
@@ -65,6 +66,7 @@ class _Team:
 
     def _begin(self, seed: int | None) -> tuple[dict[str, np.ndarray], Infos]:
         """Starts an episode; observations and infos of all robots."""
+        common.require_own_process()
         if seed is not None or self._key is None:
             (word,) = np.random.SeedSequence(seed).generate_state(1)
             self._key = jax.random.key(int(word))
@@ -139,7 +141,7 @@ class TeamAECEnv(_Team, AECEnv):
         self.agent_selection = self._turn()
 
     def observe(self, agent: str) -> np.ndarray:
-        """A robot's observation, `[S]` float32."""
+        """A robot's observation, `[S]` float32; its last one if it has left."""
         return self._observations[agent].copy()
 
     def step(self, action: Any) -> None:
@@ -158,7 +160,8 @@ class TeamAECEnv(_Team, AECEnv):
             self._was_dead_step(action)
             return
         result = self._advance(self._checked(agent, "action", action))
-        self._observations, self.rewards, self.terminations, self.truncations, self.infos = result
+        seen, self.rewards, self.terminations, self.truncations, self.infos = result
+        self._observations |= seen  # of robots that have left, the last one stays
         self._cumulative_rewards[agent] = 0.0
         self._accumulate_rewards()
         self.agent_selection = self._turn()

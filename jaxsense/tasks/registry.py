@@ -18,7 +18,7 @@ from jaxsense.tasks import archive
 from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin
-from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, key_of_seed
+from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, fixed_draws, key_of_seed
 from jaxsense.training.mdp import models_of
 
 TASKS = {
@@ -126,6 +126,24 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
     return task
 
 
+def require_unchanged(task: Task) -> None:
+    """Checks that a task with the name of a frozen one has its networks, looks and rewards.
+
+    Args:
+      task: from `make`, perhaps with other fields.
+
+    Raises:
+      ConfigError: if it has been changed under its name.
+    """
+    if task.name not in TASKS:
+        return
+    made = make(task.name, task.agent)
+    is_same = jax.tree.structure(task) == jax.tree.structure(made)
+    if not is_same or not all(map(np.array_equal, jax.tree.leaves(task), jax.tree.leaves(made))):
+        expected = "must be as made; give a changed task another name, with dataclasses.replace"
+        raise ConfigError("task", task, expected)
+
+
 def freeze(
     key: Key, file: Path, name: str, config: Config, trained: Models, looks: Samples, made: Origin
 ) -> None:
@@ -158,6 +176,7 @@ def freeze(
     archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
 
 
+@fixed_draws()
 def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
     """Mean returns of the policies to compare with.
 

@@ -16,8 +16,8 @@ from jaxsense.config import ConfigError
 from jaxsense.config.checks import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.tasks.registry import as_task, reference_returns
-from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, key_of_seed
+from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged
+from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, fixed_draws, key_of_seed
 
 _NUMBERS = jax.Array | np.ndarray | np.generic | float | int
 _UNTRACEABLE = (
@@ -121,6 +121,7 @@ class Score:
         return "\n  ".join(lines)
 
 
+@fixed_draws()
 def score(
     task: Task | str,
     policy: Policy | Recurrent | Sequence[Policy | Recurrent],
@@ -140,15 +141,17 @@ def score(
       episodes: with each seed.
 
     Returns:
-      The score. Its starts and looks are always the same, and no training should see them.
+      The score. Its starts and looks are always the same, whatever JAX's settings of random
+      numbers are, and no training should see them.
 
     Raises:
-      ConfigError: if there is no such task or agent, or if a policy is not such a function or
-        returns values of another shape or dtype.
+      ConfigError: if there is no such task or agent, if a task was changed and kept its name, or if
+        a policy is not such a function or returns values of another shape or dtype.
       ValueError: if a policy's actions do not exist, or if JAX cannot trace it.
     """
     checks.require_number("episodes", episodes)
     task = as_task(task, agent)
+    require_unchanged(task)
     if isinstance(policy, str):  # a sequence, too
         raise ConfigError("policy", policy, _IS_POLICY)
     policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
@@ -163,7 +166,7 @@ def score(
     played = {name: _player(each) for name, each in own.items()}
     pairs = zip(keys, policies, strict=True)
     returns = [played[id(each)](key, task, episodes) for key, each in pairs]
-    if episodes == EPISODES and seeds <= SEEDS:
+    if task.name in TASKS and episodes == EPISODES and seeds <= SEEDS:
         known = np.asarray(task.returns)[:, :seeds]
         references = dict(zip(task.references, known, strict=True))
     else:
@@ -196,10 +199,11 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
         del key
         shape = jax.ShapeDtypeStruct((), jnp.int32)
         # An error within a program would lose its message among many lines.
-        choose(np.zeros((2, *observation.shape), np.float32))
+        with jax.ensure_compile_time_eval():
+            choose(np.zeros((2, *observation.shape), np.float32))
 
         def call(observations: ArrayLike) -> np.ndarray:
-            batch = np.asarray(observations)
+            batch = np.array(observations)  # a copy, as policies may write into it
             return choose(batch.reshape(-1, batch.shape[-1])).reshape(batch.shape[:-1])
 
         return jax.pure_callback(call, shape, observation, vmap_method="broadcast_all")

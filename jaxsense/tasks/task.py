@@ -4,7 +4,8 @@ A task is an MDP with frozen networks whose looks are drawn from stored detectio
 part of its name and changes with anything that changes a score.
 """
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from typing import Protocol, TypeVar
 
 import jax
@@ -32,6 +33,7 @@ EPISODES = 1024
 """Number of episodes of a score with each seed."""
 
 _FIRST_SEED = 2**31  # far from those that anybody trains with
+_IMPLEMENTATION = "threefry2x32"  # of random numbers, in all scores
 
 Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 """`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
@@ -206,7 +208,7 @@ class MapTask(OneAgent):
         """Plays an episode with one of `references`, see `Task.play_reference`."""
         exact, (start, key) = self.models.bayes, self._start(key)
         # The same in every episode, so that it is simulated once.
-        table_key = jax.random.key(0)
+        table_key = _key(0)
         best = reference(table_key, self.mdp, self.modality, self.models, exact.labels)
 
         def choose(key: Key, known: Known) -> jax.Array:
@@ -355,9 +357,21 @@ class TeamTask:
         return episodes.run_team(play_key, self.mdp, choose, memory, start)[0]
 
 
+@contextlib.contextmanager
+def fixed_draws() -> Iterator[None]:
+    """Context in which a key yields the same numbers whatever JAX's settings are."""
+    with jax.threefry_partitionable(True), jax.default_prng_impl(_IMPLEMENTATION):
+        yield
+
+
 def key_of_seed(seed: int) -> Key:
     """The key of the episodes of a score with a seed, from 0; no training has it."""
-    return jax.random.key(_FIRST_SEED + seed)
+    return _key(_FIRST_SEED + seed)
+
+
+def _key(seed: int) -> Key:
+    """`jax.random.key` of a 32-bit seed, whatever JAX's settings are."""
+    return jax.random.wrap_key_data(jnp.array([0, seed], jnp.uint32), impl=_IMPLEMENTATION)
 
 
 def _of_belief(belief: Belief) -> Float[Array, "N F"]:

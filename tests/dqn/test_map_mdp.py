@@ -156,6 +156,22 @@ def test_a_step_is_rewarded_by_the_reward_of_its_mdp():
         assert outcome.reward == expected
 
 
+@pytree
+class OfEachClass:
+    """Returns a number for each class where a reward is one number."""
+
+    def information(self, belief, probabilities):
+        return probabilities
+
+    def of_gain(self, gain):
+        return gain
+
+
+def test_a_reward_of_several_numbers_is_refused():
+    with pytest.raises(ValueError, match=r"reward of a look has the shape \(3,\): must be \(\)"):
+        map_mdp.step(jax.random.key(0), replace(MDP, reward=OfEachClass()), start(), 0, 0)
+
+
 def test_a_look_changes_the_belief_and_the_seen_bit_of_its_poi_alone():
     before = start(seen=jnp.zeros((3, 2), bool))
     for poi in range(3):

@@ -1,6 +1,7 @@
 """The replay ring against a deque, and that draws are uniform."""
 
 import collections
+import dataclasses
 from dataclasses import astuple
 
 import chex
@@ -122,3 +123,26 @@ def test_parts_of_a_transition_have_the_dtypes_they_were_added_with():
     drawn = sample(jnp.zeros((BLOCKS, 2)), ring)
     kinds = [x.dtype for x in astuple(drawn)]
     assert kinds == [x.dtype for x in astuple(transitions(range(NUM_ENVS)))]
+
+
+def test_transitions_of_16_bits_keep_their_actions():
+    ring = replay.init(2, ROUNDS, BLOCKS, WIDTH)
+    given = transitions(np.arange(NUM_ENVS))
+    halved = dataclasses.replace(
+        jax.tree.map(lambda x: jnp.asarray(x, jnp.bfloat16), given),
+        # 16 bits would round 257 to 256.
+        a_tm1=jnp.arange(257, 257 + NUM_ENVS),
+    )
+    held = everything(replay.add(ring, halved), 1)
+    np.testing.assert_array_equal(held.a_tm1[0], halved.a_tm1)
+    np.testing.assert_array_equal(held.s_t[0], given.s_t)
+    assert held.r_t.dtype == np.float32
+
+
+def test_draws_of_16_bits_would_not_reach_every_round():
+    ring = add(replay.init(2, ROUNDS, BLOCKS, WIDTH), transitions(np.arange(NUM_ENVS)))
+    for dtype in (jnp.bfloat16, jnp.float16):
+        with pytest.raises(
+            ValueError, match=rf"draws of dtype {jnp.dtype(dtype)}: must be float32"
+        ):
+            replay.sample(jnp.zeros((3, 2), dtype), ring)

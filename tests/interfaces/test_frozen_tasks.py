@@ -1,6 +1,7 @@
 """Frozen tasks by the same names in every library: spaces, masks, seeds and their own checks."""
 
 import functools
+import importlib
 import json
 import warnings
 
@@ -11,6 +12,7 @@ import pytest
 
 import jaxsense
 from jaxsense.config import ConfigError
+from jaxsense.interfaces import common
 from jaxsense.tasks.environment import CLIP
 
 NAMES = jaxsense.registered()
@@ -42,6 +44,43 @@ def play(env, seed, number):
         if terminated or truncated:
             break
     return np.array(seen), np.array(masks), np.array(rewards)
+
+
+def test_a_forked_process_is_told_to_spawn(gymnasium, monkeypatch):
+    monkeypatch.setattr(common, "_processes", set())
+    env = gymnasium.make("jaxsense/map-v0")
+    monkeypatch.setattr(common.os, "getpid", lambda: -1)  # as in a process forked from this one
+    with pytest.raises(RuntimeError, match=r"was forked .*: start processes with spawn, as vector"):
+        env.reset(seed=0)
+    with pytest.raises(RuntimeError, match="was forked"):
+        gymnasium.make_vec("jaxsense/map-v0", 2).reset(seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:os.fork", "ignore:.*ERROR")
+def test_asynchronous_environments_of_gymnasium_do_not_hang(gymnasium):
+    make_vec = functools.partial(
+        gymnasium.make_vec, "jaxsense/map-v0", 2, vectorization_mode="async"
+    )
+    envs = make_vec(vector_kwargs={"context": "fork"})
+    with pytest.raises(RuntimeError, match="was forked"):
+        envs.reset(seed=0)
+    envs.close(terminate=True)
+    envs = make_vec(vector_kwargs={"context": "spawn"})
+    assert envs.reset(seed=0)[0].shape == (2, 12)
+    envs.close()
+
+
+@pytest.mark.parametrize("library", ["gymnax", "jaxmarl"])
+def test_environments_of_a_task_share_their_programs(library):
+    pytest.importorskip(library, reason=f"needs the extra jaxsense[{library}]")
+    form = importlib.import_module(f"jaxsense.interfaces.{library}")
+    made = {"gymnax": lambda: form.make_env("map-v0"), "jaxmarl": lambda: form.make("team-v0")}
+    first, second = made[library](), made[library]()
+    compiled = jax.jit(lambda env, key: env.reset(key), static_argnums=0)
+    compiled(first, jax.random.key(0))
+    compiled(second, jax.random.key(0))
+    assert compiled._cache_size() == 1
 
 
 def test_gymnasium_has_every_task(gymnasium):

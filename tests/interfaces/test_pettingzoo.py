@@ -51,13 +51,14 @@ def test_turns_are_the_steps_of_the_parallel_environment(env, seed):
     observations, infos = env.reset(seed=seed)
     assert turns.agents == AGENTS
     totals, earned, moves = dict.fromkeys(AGENTS, 0.0), dict.fromkeys(AGENTS, 0.0), 0
-    rng = np.random.default_rng(seed)
+    rng, left = np.random.default_rng(seed), {}
     for agent in turns.agent_iter():
         seen, reward, terminated, truncated, info = turns.last()
         earned[agent] += reward
         if terminated or truncated:
             turns.step(None)
             assert agent not in turns.agents
+            left[agent] = seen
             continue
         assert agent == env.possible_agents[int(env._state.agent)]
         np.testing.assert_array_equal(seen, observations[agent])
@@ -65,6 +66,8 @@ def test_turns_are_the_steps_of_the_parallel_environment(env, seed):
         np.testing.assert_array_equal(info["action_mask"], infos[agent]["action_mask"])
         action = int(rng.choice(np.flatnonzero(info["action_mask"])))
         turns.step(action)
+        for name, last in left.items():  # wrappers ask robots that have left, too
+            np.testing.assert_array_equal(turns.observe(name), last)
         observations, rewards, terminations, truncations, infos = env.step({agent: action})
         moves += 1
         assert (turns.rewards, turns.terminations, turns.truncations) == (

@@ -1,5 +1,6 @@
 """Scores of policies in frozen tasks."""
 
+import dataclasses
 import importlib
 
 import jax
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import tasks
+from jaxsense import dqn, tasks
 from jaxsense.config import ConfigError
-from jaxsense.tasks.task import EPISODES
+from jaxsense.tasks import registry
+from jaxsense.tasks.task import EPISODES, MapTask
 
 NAME = "map-v0"
 
@@ -57,6 +59,61 @@ def test_a_policy_on_the_host_plays_the_same_episodes():
     assert one.mean_return.value > 0
 
 
+def optimum_of_eight():
+    """Return of the optimum in eight episodes, played without the other references."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MapTask, "references", ("optimal",))
+        return registry.reference_returns(jaxsense.make(NAME), 1, 8)["optimal"]
+
+
+@pytest.fixture(scope="module")
+def of_eight():
+    return optimum_of_eight()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"jax_threefry_partitionable": False, "jax_random_seed_offset": 1},
+        {"jax_default_prng_impl": "rbg"},
+        pytest.param({"jax_default_prng_impl": "unsafe_rbg"}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform, of_eight, settings):
+    usual = {name: getattr(jax.config, name) for name in settings}
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    try:
+        found = jaxsense.score(NAME, [uniform])
+        played = optimum_of_eight()
+    finally:
+        for name, value in usual.items():
+            jax.config.update(name, value)
+    np.testing.assert_array_equal(found.returns, of_uniform.returns[:1])
+    np.testing.assert_array_equal(played, of_eight)
+
+
+def with_reward(task, reward):
+    return dataclasses.replace(task, mdp=dataclasses.replace(task.mdp, reward=reward))
+
+
+@pytest.mark.parametrize("reward", [dqn.Nats(0.2), dqn.Paper(0.0)])
+def test_a_changed_task_has_no_score_under_its_name(reward):
+    changed = with_reward(jaxsense.make("noisy-v0"), reward)
+    with pytest.raises(ConfigError, match=r"task = .*noisy-v0.*: must be as made; give a changed"):
+        jaxsense.score(changed, nop)
+
+
+def test_a_task_with_a_name_of_its_own_is_compared_in_itself(monkeypatch):
+    monkeypatch.setattr(MapTask, "references", ("optimal",))  # the others take time
+    task = jaxsense.make("noisy-v0")
+    named = dataclasses.replace(with_reward(task, dqn.Nats(0.2)), name="mine")
+    found = jaxsense.score(named, [nop])
+    assert found.task == "mine"
+    # Looks cost .2 in place of .1 nats: the optimum earns less than the one that is stored.
+    assert 0 < found.references["optimal"][0] < 0.9 * task.returns[0, 0]
+
+
 @pytest.mark.slow
 def test_a_policy_that_remembers_looks_at_each_poi_once():
     def act(key, memory, observation):
@@ -75,6 +132,16 @@ def test_policies_of_several_trainings_play_a_seed_each(of_uniform):
     found = jaxsense.score(NAME, [uniform, nop])
     np.testing.assert_allclose(found.returns, [of_uniform.returns[0], 0.0], rtol=1e-6)
     np.testing.assert_array_equal(found.references["optimal"], of_uniform.references["optimal"][:2])
+
+
+@pytest.mark.parametrize("library", [np, jnp])
+def test_a_policy_on_the_host_may_use_jax_and_write_into_its_observations(library):
+    def first_unknown(observations):
+        observations -= 1.5
+        widths = library.asarray(observations)[:, 2::4]
+        return library.where(widths.max(axis=1) > 0, widths.argmax(axis=1), 3)
+
+    assert jaxsense.score(NAME, [tasks.on_host(first_unknown)]).mean_return.value > 0
 
 
 @pytest.mark.slow
