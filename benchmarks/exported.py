@@ -1,13 +1,11 @@
 """How far exported programs are from ours, and how long they take: `python -m benchmarks.exported`.
 
-Plays missions of runs, and asks the programs of their archives, with NumPy and, if it is installed,
-with onnxruntime on one core, what ours say in the same states.
+Plays missions of runs, and asks the programs of their archives, with onnxruntime on one core, what
+ours say in the same states.
 """
 
-import contextlib
 import dataclasses
 import io
-import os
 import sys
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -24,21 +22,15 @@ from jaxsense import export
 from jaxsense.config import Config
 from jaxsense.config.checks import check_fields, limited
 from jaxsense.config.options import Name
-from jaxsense.interfaces import robot_numpy
+from jaxsense.interfaces import robot
 from jaxsense.interfaces.onboard import Function, functions
 from jaxsense.models import Models
 from jaxsense.run import cli, devices
 
 PROGRAM = "benchmarks.exported"
-LOADERS = {"NumPy": robot_numpy.load}
-"""What plays an archive."""
-with contextlib.suppress(ModuleNotFoundError):
-    from jaxsense.interfaces import robot_onnx
-
-    LOADERS["onnxruntime"] = robot_onnx.load
+PLAYER = "onnxruntime"
 SHOWN = ("decide", "detect_camera", "detect_lidar", "write_lidar", "classify")
 """Programs in the tables of the pages."""
-_THREADS = "OPENBLAS_NUM_THREADS"  # of NumPy
 _TIMED = 200
 _CLOSED = 1e5  # above any value of an action that is open
 _TINY = 1e-3  # scale of an output that is about 0
@@ -85,8 +77,8 @@ class Compared:
 
 def compare(
     config: Config, models: Models, archive: bytes, found: list[Choice]
-) -> dict[str, dict[str, Compared]]:
-    """Compares all programs that a mission plays, by player and program.
+) -> dict[str, Compared]:
+    """Compares all programs that a mission plays, by name.
 
     Args:
       config: settings of the run.
@@ -110,12 +102,9 @@ def compare(
     actions = [int(each["action"]) for each in expected["decide"]]
     assert actions == [int(choice.action) for choice in found]
     return {
-        player: {
-            name: _compared(program, given[name], expected[name])
-            for name, program in load(io.BytesIO(archive))[1].items()
-            if name in given
-        }
-        for player, load in LOADERS.items()
+        name: _compared(program, given[name], expected[name])
+        for name, program in robot.load(io.BytesIO(archive))[1].items()
+        if name in given
     }
 
 
@@ -194,18 +183,14 @@ def measure(arguments: Arguments) -> dict[str, object]:
     Args:
       arguments: of the program.
     """
-    packages = [name for name in LOADERS if name == "onnxruntime"]
-    results = studies.origin(PROGRAM, arguments, ("onnx", *packages))
-    if (threads := os.environ.get(_THREADS)) is not None:
-        results["command"] = f"{_THREADS}={threads} {results['command']}"
+    results = studies.origin(PROGRAM, arguments, ("onnx", PLAYER))
     results["programs"] = {}
     for run in arguments.runs:
         config, models = studies.load(PROGRAM, run, arguments.trust)
         found = choices(config, models, arguments.states)
         compared = compare(config, models, export.archive(config, models), found)
         results["programs"][str(run)] = {
-            player: {name: dataclasses.asdict(each) for name, each in programs.items()}
-            for player, programs in compared.items()
+            PLAYER: {name: dataclasses.asdict(each) for name, each in compared.items()}
         }
     return results
 
@@ -217,28 +202,24 @@ def table(results: Mapping[str, Any], programs: Collection[str] | None = None) -
       results: the content of the JSON file.
       programs: names of the programs to show; all by default.
     """
-    rows, players = [], [*LOADERS]
-    for run, found in results["programs"].items():
-        players = [*found]
-        for name, first in found[players[0]].items():
-            if programs is None or name in programs:
-                each = [found[player][name] for player in players]
-                different = max(x["different"] for x in each)
-                rows.append(
-                    [
-                        f"`{studies.name_of(run)}`",
-                        f"`{name}`",
-                        f"{different} of {first['states']:,}",
-                        f"{max(x['error'] for x in each):.1e}",
-                        *(_microseconds(x) for x in each),
-                    ]
-                )
-    heads = ["run", "program", "different answers", "error", *players]
+    rows = [
+        [
+            f"`{studies.name_of(run)}`",
+            f"`{name}`",
+            f"{each['different']} of {each['states']:,}",
+            f"{each['error']:.1e}",
+            _microseconds(each),
+        ]
+        for run, found in results["programs"].items()
+        for name, each in found[PLAYER].items()
+        if programs is None or name in programs
+    ]
+    heads = ["run", "program", "different answers", "error", "latency"]
     return studies.with_origin(studies.as_table(heads, rows), results)
 
 
 def latencies(results: Mapping[str, Any], runs: Sequence[str], programs: Sequence[str]) -> str:
-    """Latencies with NumPy, in Markdown.
+    """Latencies, in Markdown.
 
     Args:
       results: the content of the JSON file.
@@ -248,7 +229,7 @@ def latencies(results: Mapping[str, Any], runs: Sequence[str], programs: Sequenc
     rows = [
         [
             f"`{name}`",
-            *(_microseconds(results["programs"][run]["NumPy"][name]) for run in runs),
+            *(_microseconds(results["programs"][run][PLAYER][name]) for run in runs),
         ]
         for name in programs
     ]
@@ -270,8 +251,6 @@ def main(argv: list[str] | None = None) -> None:
     results = measure(arguments)
     studies.write(arguments.json, results)
     print(table(results))
-    if "onnxruntime" not in LOADERS:
-        print("NumPy alone: onnxruntime is not installed; pip install onnxruntime")
 
 
 if __name__ == "__main__":

@@ -188,7 +188,7 @@ TABLES: Mapping[str, _Tables] = {
     "raw_depth.json": {None: partial(raw.written, make=raw.of_depth)},
     "exported.json": {
         None: partial(exported.table, programs=exported.SHOWN),
-        "numpy": partial(
+        "latencies": partial(
             exported.latencies,
             runs=("pretrained:default", "pretrained:noisy"),
             programs=("detect_camera", "detect_lidar", "write_lidar", "decide", "classify"),

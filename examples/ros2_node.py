@@ -1,14 +1,15 @@
-"""A ROS 2 node by which a robot takes part in a mission, with an exported run and NumPy alone.
+"""A ROS 2 node by which a robot takes part in a mission, with an exported run and onnxruntime.
 
     jaxsense export pretrained:noisy --out robot.zip
     python3 ros2_node.py robot.zip --robot 1 --pois 1.0,0.5 -1.2,0.8 0.3,-1.1
 
-Copy this file, `run_exported.py` and the archive to the robot. `--robot` says which robot of the
-run it is, `--pois` where the points of interest (PoIs) stand in the frame `map`. The node reads
-`scan` (sensor_msgs/LaserScan), or `image` and `camera_info` (sensor_msgs/Image, rectified), and the
-transforms between `map`, `base_link` and the sensor. It publishes from where to look as `goal_pose`
-(geometry_msgs/PoseStamped), to which Nav2 drives, exchanges looks with the other robots on `team`,
-and says on `classes` what each PoI probably is (both std_msgs/String, JSON).
+Copy this file, `run_exported.py`, the archive, and `interfaces/robot.py` and `sim/resampling.py` of
+jaxsense to the robot. `--robot` says which robot of the run it is, `--pois` where the points of
+interest (PoIs) stand in the frame `map`. The node reads `scan` (sensor_msgs/LaserScan), or `image`
+and `camera_info` (sensor_msgs/Image, rectified), and the transforms between `map`, `base_link` and
+the sensor. It publishes from where to look as `goal_pose` (geometry_msgs/PoseStamped), to which
+Nav2 drives, exchanges looks with the other robots on `team`, and says on `classes` what each PoI
+probably is (both std_msgs/String, JSON).
 
 The functions and the class `Robot` do the work; they read messages by their fields alone, so that
 they run and are tested where there is no ROS. `main` connects them to topics.
@@ -18,13 +19,11 @@ they run and are tested where there is no ROS. `main` connects them to topics.
 import argparse
 import collections
 import dataclasses
-import importlib
 import itertools
 import json
 import math
 import re
 import sys
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,11 +31,13 @@ from typing import Any
 import numpy as np
 
 try:
-    from run_exported import Programs, empty, remember, write
+    from run_exported import Programs, empty, imported, load, remember, write
 except ModuleNotFoundError as error:
     if error.name != "run_exported":
         raise
     sys.exit("needs run_exported.py: copy it next to this file")
+
+resampling = imported("resampling", "jaxsense.sim")
 
 VIEW_DISTANCE = 0.9  # m, from the sensor to a PoI
 VIEW_SIDES = 16  # directions around a PoI that are tried
@@ -48,7 +49,6 @@ STILL_FOR = 0.1  # s, within which a robot that stands still moves by no more th
 SILENCE = 5.0  # s, after which a robot that tells nothing counts as failed
 PATIENCE = 60.0  # s, after which a robot that has not looked gives its viewpoint up
 NEW = 0.5  # share of a look that must be new
-MAX_STEPS = 3.0  # of the run's beams, from one beam of the robot's scanner to the next
 
 _ENCODINGS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0]}
 
@@ -215,7 +215,6 @@ class Robot:
         self,
         contents: dict[str, Any],
         programs: Programs,
-        resampling: Any,
         robot: int,
         positions: np.ndarray,
     ):
@@ -224,7 +223,6 @@ class Robot:
         Args:
           contents: of the archive.
           programs: of the archive.
-          resampling: the archive's module of this name.
           robot: its index in the `robots` of the archive.
           positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
 
@@ -248,7 +246,7 @@ class Robot:
             raise ValueError(f"{pois} PoIs: the policy of this archive is for {expected}; {anyway}")
         if "merge" in programs:
             raise ValueError("robots have maps of their own: see `tell` in run_exported.py")
-        self.contents, self.programs, self.resampling = contents, programs, resampling
+        self.contents, self.programs = contents, programs
         self.robot = robot
         self.name = contents["robots"][robot]
         self.mounting, self.is_upside_down = np.zeros(3), False
@@ -435,8 +433,8 @@ class Robot:
         """Raises `ValueError` if beams or pixels are too far apart."""
         own = self.contents["sensors"][self.name]["angles"]
         step, own_step = (np.degrees(np.median(np.abs(np.diff(each)))) for each in (angles, own))
-        if step > MAX_STEPS * own_step:
-            expected = f"must be at most {MAX_STEPS * own_step:.2f}; train with the sensor's own"
+        if step > (most := resampling.MAX_STEPS * own_step):
+            expected = f"must be at most {most:.2f}; train with the sensor's own"
             raise ValueError(f"step between beams = {step:.2f} degrees: {expected}")
 
     def _along_own_rays(self, scan: Scan) -> np.ndarray:
@@ -444,9 +442,9 @@ class Robot:
         own = np.array(self.contents["sensors"][self.name]["angles"])
         measures_distance, readings = scan.readings.ndim == 1, scan.readings
         if measures_distance:
-            step = self.resampling.median_step(own)
-            readings = self.resampling.close_gaps(scan.angles, readings, step=step)
-        return self.resampling.resample(
+            step = resampling.median_step(own)
+            readings = resampling.close_gaps(scan.angles, readings, step=step)
+        return resampling.resample(
             own,
             -scan.angles if self.is_upside_down else scan.angles,
             readings,
@@ -483,20 +481,6 @@ class Robot:
             if way < shortest and is_free and self._weight(poi, pose) >= NEW:
                 found, shortest = pose, way
         return found
-
-
-def load(archive: Path, robot: int, positions: np.ndarray) -> Robot:
-    """A robot of an archive.
-
-    Args:
-      archive: file of `jaxsense export`.
-      robot: its index in the `robots` of the archive.
-      positions: `[N, 2]` of the PoIs in the frame `map`, in metres.
-    """
-    sys.path.insert(0, str(archive))  # Python imports from an archive as from a folder
-    contents, programs = importlib.import_module("robot_numpy").load(archive)
-    resampling = importlib.import_module("resampling")
-    return Robot(contents, programs, resampling, robot, positions)
 
 
 def hear(node: Any, robot: Robot, now: float, report: str) -> None:
@@ -642,11 +626,7 @@ def main() -> None:
         [f" {each}" if re.match(r"-\.?\d", each) else each for each in own]
     )
     try:
-        robot = load(arguments.archive, arguments.robot, np.array(arguments.pois))
-    except (OSError, zipfile.BadZipFile, KeyError, ImportError) as error:
-        if not arguments.archive.exists():
-            parser.error(f"{arguments.archive}: no such file")
-        parser.error(f"{arguments.archive}: must be a file of `jaxsense export` ({error})")
+        robot = Robot(*load(arguments.archive), arguments.robot, np.array(arguments.pois))
     except ValueError as error:
         parser.error(str(error))
     try:

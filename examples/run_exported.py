@@ -1,20 +1,17 @@
-"""Runs the file of `python -m jaxsense.export` with NumPy alone, or with onnxruntime.
+"""Runs the file of `python -m jaxsense.export` with onnxruntime, without JAX.
 
     python examples/run_exported.py runs/.../exported.zip
-    python examples/run_exported.py runs/.../exported.zip --onnx
 
 lets a run's robots explore the points of interest (PoIs) of one map: each asks its policy where to
 look, and updates the map with what its sensor detects there. Real robots run `detect` on their
-scans; here the features are made up. The functions are in `robot_numpy.py` and `robot_onnx.py`,
-which are in the file; copy one of them to a robot. Robots with maps of their own tell each other
-what they have seen; half of the messages are lost.
+scans; here the features are made up. Copy this file, the archive and the `interfaces/robot.py` of
+jaxsense, which plays it, to a robot. Robots with maps of their own tell each other what they have
+seen; half of the messages are lost.
 """
 
 import argparse
 import importlib
-import json
 import sys
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,6 +19,20 @@ from typing import Any
 import numpy as np
 
 Programs = dict[str, Callable[..., dict[str, np.ndarray]]]
+
+
+def imported(name: str, package: str) -> Any:
+    """A file of jaxsense: its copy next to this file, or else that of the installed package."""
+    is_copied = Path(__file__).with_name(f"{name}.py").exists()
+    try:
+        return importlib.import_module(name if is_copied else f"{package}.{name}")
+    except ModuleNotFoundError as error:
+        is_absent = error.name in (name, "jaxsense")
+        how = "copy it next to this file" if is_absent else f"pip install {error.name}"
+        sys.exit(f"needs {f'{name}.py' if is_absent else error.name}: {how}")
+
+
+load = imported("robot", "jaxsense.interfaces").load
 
 
 def explore(contents: dict[str, Any], programs: Programs, classes: list[int]) -> list[str]:
@@ -163,19 +174,11 @@ def main() -> None:
     """Runs the program."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("file", type=Path, help="from `jaxsense export`")
-    parser.add_argument("--onnx", action="store_true", help="with onnxruntime instead of NumPy")
     arguments = parser.parse_args()
-    path, name = arguments.file, "robot_onnx" if arguments.onnx else "robot_numpy"
-    # Python imports from an archive as from a folder.
-    sys.path.insert(0, str(path))
     try:
-        contents, programs = importlib.import_module(name).load(path)
-    except (OSError, zipfile.BadZipFile, json.JSONDecodeError, KeyError, ImportError) as error:
-        if isinstance(error, ImportError) and error.name == "onnxruntime":
-            sys.exit("--onnx needs onnxruntime: pip install onnxruntime")
-        if not path.exists():
-            sys.exit(f"{path}: no such file")
-        sys.exit(f"{path}: must be a file of `jaxsense export` ({error})")
+        contents, programs = load(arguments.file)
+    except ValueError as error:
+        sys.exit(str(error))
     for name, program in contents["programs"].items():
         print(f"{name}({', '.join(program['inputs'])}): {program['about']}")
     num_classes = len(contents["classes"])

@@ -1,9 +1,9 @@
 """`python -m jaxsense.export RUN`: trained models as one file for robots without JAX.
 
-The file is a zip archive: each function as an ONNX file; weights as NumPy arrays in `weights.npz`,
-and in `programs.json` the functions as operators on them; a `contents.json` that describes inputs
-and outputs; `robot_numpy.py` and `robot_onnx.py`, which run the functions; and `resampling.py`,
-which turns the scans of other sensors into those that `detect` reads.
+The file is a zip archive of data: each function as an ONNX file, and a `contents.json` that
+describes inputs and outputs. A robot runs it with two files of this package, which need neither JAX
+nor jaxsense: `interfaces/robot.py` plays the functions, and `sim/resampling.py` turns the scans of
+other sensors into those that `detect` reads.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.interfaces import onboard
+from jaxsense.interfaces.extras import extra
 from jaxsense.interfaces.graph import OPSET, Constants, as_onnx
 from jaxsense.interfaces.onboard import functions
 from jaxsense.interfaces.translate import arrays_of, program
@@ -29,14 +29,11 @@ from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
-from jaxsense.sim import resampling, sensors
+from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks.pretrained import PREFIX
 
 PROGRAM = "jaxsense.export"
-_PLAYERS = (Path(onboard.__file__).with_name(f"robot_{name}.py") for name in ("numpy", "onnx"))
-FILES = (*_PLAYERS, Path(resampling.__file__))
-"""Files for a robot, which each archive holds: they need neither JAX nor jaxsense."""
 
 
 def archive(config: Config, models: Models) -> bytes:
@@ -47,20 +44,19 @@ def archive(config: Config, models: Models) -> bytes:
       models: its trained models.
 
     Raises:
-      ModuleNotFoundError: if the package `onnx` is not installed.
+      ModuleNotFoundError: if the extra `export` is not installed.
       NotImplementedError: if a custom sensor, fusion or agent computes what has no translation.
+      ValueError: if the archive is larger than `robot.load` reads.
     """
-    content, described, graphs = io.BytesIO(), {}, {}
-    constants = Constants(arrays_of(models))
-    read: set[str] = set()
+    with extra("export"):
+        from jaxsense.interfaces import robot  # noqa: PLC0415
+    content, described, constants = io.BytesIO(), {}, Constants(arrays_of(models))
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
         for name, function in functions(config).items():
             inputs = {key: (each.dtype, each.shape) for key, each in function.inputs.items()}
             found = program(function.apply, models, inputs, constants)
             onnx = as_onnx(name, function.about, found.graph, constants.arrays, found.outputs)
             files.writestr(f"{name}.onnx", onnx)
-            graphs[name] = found.graph.as_json()
-            read |= found.graph.read()
             described[name] = {
                 "about": function.about,
                 "inputs": {
@@ -72,14 +68,9 @@ def archive(config: Config, models: Models) -> bytes:
                     for key, each in found.outputs.items()
                 },
             }
-        weights = {name: x for name, x in constants.arrays.items() if name in read}
-        np.savez(packed := io.BytesIO(), allow_pickle=False, **weights)
-        files.writestr("weights.npz", packed.getvalue())
-        files.writestr("programs.json", json.dumps(graphs))
-        for file in FILES:
-            files.writestr(file.name, file.read_bytes())
         contents = json.dumps({**_description(config, models), "programs": described}, indent=2)
         files.writestr("contents.json", contents + "\n")
+    robot.load(content)  # a robot, far away, would only see that it cannot
     return content.getvalue()
 
 
@@ -190,11 +181,12 @@ def main(argv: list[str] | None = None) -> None:
             file.write(content := archive(config, models))
     except FileExistsError:
         cli.fail(PROGRAM, str(ConfigError("out", str(path), "already exists; must be a new file")))
-    except (ConfigError, ModuleNotFoundError, NotImplementedError) as error:
+    except (ValueError, ModuleNotFoundError, NotImplementedError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"out = {str(path)!r}: cannot be written ({error.strerror or error})")
-    output.say(f"{path}: {len(content) / 1e3:.0f} kB, for NumPy and ONNX")
+    played = "a robot plays it with jaxsense/interfaces/robot.py"
+    output.say(f"{path}: {len(content) / 1e3:.0f} kB; {played}")
 
 
 if __name__ == "__main__":

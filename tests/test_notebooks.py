@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from archives import imports_from_archives
 
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "examples" / "notebooks").glob("*.ipynb"))
 
@@ -20,9 +19,8 @@ def run(path, directory, monkeypatch):
     monkeypatch.chdir(directory)
     monkeypatch.setenv("MPLBACKEND", "agg")
     names = {"__name__": "__main__"}
-    with imports_from_archives():
-        for number, cell in enumerate(cells_of(path)):
-            exec(compile(cell, f"{path.name}, cell {number}", "exec"), names)
+    for number, cell in enumerate(cells_of(path)):
+        exec(compile(cell, f"{path.name}, cell {number}", "exec"), names)
     return names
 
 

@@ -7,7 +7,6 @@ import chex
 import flax
 import numpy as np
 import pytest
-from archives import imports_from_archives
 
 from jaxsense import export
 
@@ -129,10 +128,9 @@ def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
     export.main(["pretrained:noisy", "--out", "robot.zip"])
     capsys.readouterr()
     page, names = ROOT / "docs" / "robot.md", {}
-    with imports_from_archives():
-        run_example(page, 0, names)
-        assert capsys.readouterr().out == "False {'cylinder': 0.5, 'cube': 0.5}\n"
-        run_example(page, 1, names)
+    run_example(page, 0, names)
+    assert capsys.readouterr().out == "False {'cylinder': 0.5, 'cube': 0.5}\n"
+    run_example(page, 1, names)
     assert names["scan"].shape == (683,)
     assert capsys.readouterr().out == "(683,) True\n"
 

@@ -1,4 +1,4 @@
-"""Graphs of ONNX operators, and how they are written: as JSON, which NumPy plays, and as ONNX."""
+"""Graphs of ONNX operators, and how they are written as ONNX files."""
 
 import dataclasses
 import itertools
@@ -41,11 +41,6 @@ class Node:
         graphs = {name: graph.pruned() for name, graph in self.graphs.items()}
         return dataclasses.replace(self, graphs=graphs)
 
-    def as_json(self) -> tuple[object, ...]:
-        """The operator for `json.dumps`."""
-        graphs = {name: graph.as_json() for name, graph in self.graphs.items()}
-        return self.operator, self.inputs, self.outputs, {**self.attributes, **graphs}
-
 
 @dataclasses.dataclass
 class Graph:
@@ -73,11 +68,6 @@ class Graph:
                 kept.append(node.pruned())
                 wanted |= kept[-1].read()
         return dataclasses.replace(self, nodes=kept[::-1])
-
-    def as_json(self) -> dict[str, object]:
-        """The graph for `json.dumps`."""
-        nodes = [node.as_json() for node in self.nodes]
-        return {"inputs": [*self.inputs], "outputs": self.outputs, "nodes": nodes}
 
 
 class Constants:

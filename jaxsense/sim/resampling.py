@@ -1,6 +1,6 @@
 """Scans along other rays than they were recorded along, with NumPy alone.
 
-`python -m jaxsense.export` puts this file into each archive, so that robots have it without JAX.
+Robots copy this file; it imports neither JAX nor the rest of jaxsense.
 """
 
 import numpy as np

@@ -119,16 +119,16 @@ def fuse(
     checks.require_finite("belief.mean", belief.mean)
     checks.require_positive("belief.std", belief.std)
     generated = jmvae.decode(params, model, belief.mean)
-    others = [m for m, new in enumerate(features) if new is None]
+    is_new = np.array([new is not None for new in features])
+    others = np.flatnonzero(~is_new).tolist()
     fused = belief
     # One encoder for each set of modalities that may have looked before; `seen` selects one.
     for size in range(len(others) + 1):
         for subset in itertools.combinations(others, size):
             inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
             candidate = jmvae.posterior(params, model, inputs)
-            applies = jnp.bool_(True)
-            for m in others:
-                applies &= jnp.asarray(seen)[m] == (m in subset)
+            is_subset = np.array([m in subset for m in range(len(features))])
+            applies = jnp.all(is_new | (jnp.asarray(seen) == is_subset))
             fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
     for name, new in zip(model.modalities, features, strict=True):
         if new is not None:

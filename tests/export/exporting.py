@@ -1,8 +1,10 @@
 """Settings and models for tests of exported files, and processes that play them."""
 
 import dataclasses
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -11,34 +13,37 @@ import numpy as np
 
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.core.types import Belief
+from jaxsense.interfaces import robot
 from jaxsense.models import make_in_place
+from jaxsense.sim import resampling
 from jaxsense.vae.novelty import Novelty
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "run_exported.py"
+COPIED = EXAMPLE, Path(robot.__file__), Path(resampling.__file__)
+"""What a robot needs besides an archive."""
 CONFIG = dataclasses.replace(
     PRESETS["smoke"],
     detector=DetectorConfig(hidden=(8,)),
     jmvae=JmvaeConfig(hidden=(8,)),
 )
-ALONE = f"""
-import runpy, sys
+ALONE = """
+import sys
 
 absent = sys.argv.pop(1).split(",")
 
 class Only:
     def find_spec(self, name, *_):
         if name.partition(".")[0] in absent:
-            raise ModuleNotFoundError(f"{{name}} is not here", name=name)
+            raise ModuleNotFoundError(f"{name} is not here", name=name)
 
 sys.meta_path.insert(0, Only())
-example = runpy.run_path({str(EXAMPLE)!r})
+sys.path.insert(0, sys.argv.pop(1))
 """
 RUN_ALL = """
-import importlib
 import numpy as np
-sys.path.insert(0, sys.argv[1])
-contents, programs = importlib.import_module(sys.argv[2]).load(sys.argv[1])
-inputs, found = np.load(sys.argv[3]), {}
+from robot import load
+contents, programs = load(sys.argv[1])
+inputs, found = np.load(sys.argv[2]), {}
 for name, about in contents["programs"].items():
     given = {key: inputs[f"{name}/{key}"] for key in about["inputs"] if f"{name}/{key}" in inputs}
     if not given:
@@ -46,25 +51,25 @@ for name, about in contents["programs"].items():
     rows = [programs[name](**{key: x[row] for key, x in given.items()})
             for row in range(len(next(iter(given.values()))))]
     found |= {f"{name}/{key}": np.stack([row[key] for row in rows]) for key in rows[0]}
-np.savez(sys.argv[4], **found)
+np.savez(sys.argv[3], **found)
 """
-ABSENT = {
-    "robot_numpy": "jaxsense,jax,jaxlib,onnx,onnxruntime",
-    "robot_onnx": "jaxsense,jax,jaxlib,onnx",
-}
+ABSENT = "jaxsense,jax,jaxlib,onnx"
 
 
-def run_alone(code, player, *arguments):
-    """Runs code where nothing is there but what a player needs."""
-    command = [sys.executable, "-I", "-c", ALONE + code, ABSENT[player], *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def run_alone(code, *arguments, absent=ABSENT, copied=COPIED):
+    """Runs code where nothing is there but what a robot needs."""
+    with tempfile.TemporaryDirectory() as folder:
+        for file in copied:
+            shutil.copy(file, folder)
+        command = [sys.executable, "-I", "-c", ALONE + code, absent, folder, *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def played(path, player, inputs, folder):
-    """What a player's programs give for `{NAME/KEY: array}`, alone."""
-    given, found = folder / "in.npz", folder / f"{player}.npz"
+def played(path, inputs, folder):
+    """What a robot's programs give for `{NAME/KEY: array}`, alone."""
+    given, found = folder / "in.npz", folder / "out.npz"
     np.savez(given, **inputs)
-    done = run_alone(RUN_ALL, player, path, player, given, found)
+    done = run_alone(RUN_ALL, path, given, found)
     assert done.returncode == 0, done.stderr
     return dict(np.load(found))
 

@@ -3,18 +3,15 @@
 import dataclasses
 import json
 import re
-import runpy
 import sys
 import zipfile
-from types import SimpleNamespace
 
 import jax
 import onnx
 import pytest
-from exporting import ABSENT, CONFIG, run_alone
+from exporting import ABSENT, CONFIG, COPIED, run_alone
 from smoke import error_line
 
-from benchmarks import exported
 from jaxsense import export, interfaces
 from jaxsense.models import init
 
@@ -41,46 +38,38 @@ def test_contents_hold_the_belief_before_any_look(variance):
     assert contents["unseen"] == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
 
 
-@pytest.mark.parametrize("player", [*ABSENT])
-def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path, player):
-    options = ["--onnx"] if player == "robot_onnx" else []
-    done = run_alone("example['main']()", player, file, *options)
+EXAMPLE = "import run_exported\nrun_exported.main()"
+
+
+def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path):
+    done = run_alone(EXAMPLE, file)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert [line for line in lines if line.startswith("PoI 2 is a red cube; the map says: ")]
-    (tmp_path / "text").write_text("no archive")
-    done = run_alone("example['main']()", player, tmp_path / "text", *options)
+    done = run_alone(EXAMPLE, tmp_path / "nothing")
     assert done.returncode == 1
-    assert "must be a file of `jaxsense export`" in done.stderr
-    done = run_alone("example['main']()", player, tmp_path / "nothing", *options)
-    assert done.returncode == 1
-    assert done.stderr.endswith("nothing: no such file\n")
+    assert done.stderr.endswith("nothing: cannot be read (no such file)\n")
 
 
-def test_the_example_names_the_missing_onnxruntime(file):
-    done = run_alone("example['main']()", "robot_numpy", file, "--onnx")
-    assert done.returncode == 1
-    assert done.stderr == "--onnx needs onnxruntime: pip install onnxruntime\n"
+@pytest.mark.parametrize(
+    ("absent", "copied", "expected"),
+    [
+        (f"{ABSENT},onnxruntime", COPIED, "onnxruntime: pip install onnxruntime"),
+        (ABSENT, COPIED[:1], "robot.py: copy it next to this file"),
+    ],
+)
+def test_the_example_names_what_is_missing(file, absent, copied, expected):
+    done = run_alone(EXAMPLE, file, absent=absent, copied=copied)
+    assert (done.returncode, done.stderr) == (1, f"needs {expected}\n")
 
 
-def test_the_comparison_needs_numpy_alone(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    monkeypatch.delitem(sys.modules, "jaxsense.interfaces.robot_onnx", raising=False)
-    monkeypatch.delattr(interfaces, "robot_onnx", raising=False)
-    names = runpy.run_path(exported.__file__)
-    assert [*names["LOADERS"]] == ["NumPy"]
-    main, stub = names["main"], SimpleNamespace(load=lambda *_: [None] * 3, archive=lambda *_: b"")
-    stubs = {"export": stub, "choices": lambda *_: [], "compare": lambda *_: {"NumPy": {}}}
-    for name, each in {**stubs, "devices": SimpleNamespace(start=lambda *_: None)}.items():
-        monkeypatch.setitem(main.__globals__, name, each)
-    main(["pretrained:default"])
-    assert "NumPy alone: onnxruntime is not installed" in capsys.readouterr().out
-
-
-def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "onnx", None)
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, "jaxsense.interfaces.robot", raising=False)
+    monkeypatch.delattr(interfaces, "robot", raising=False)
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
-    assert line == "jaxsense.export: onnx is not installed: pip install 'jaxsense[export]'"
+    assert line == f"jaxsense.export: {package} is not installed: pip install 'jaxsense[export]'"
     assert not [*tmp_path.iterdir()]
 
 
@@ -128,16 +117,14 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_robot_resamples_scans_without_jaxsense(file):
+def test_a_robot_resamples_scans_without_jaxsense():
     code = """
 import numpy as np
-
-sys.path.insert(0, sys.argv[1])
 from resampling import resample
 
 angles, ranges = np.array([-0.1, 0.1]), np.array([1.0, 1.04])
 print(resample(np.array([0.05, 0.15, 1.0]), angles, ranges, measures_distance=True))
 """
-    found = run_alone(code, "robot_numpy", file)
+    found = run_alone(code)
     # Three quarters of the way between both beams; a quarter of a step beyond the second one.
     assert (found.stdout, found.returncode) == ("[1.03 1.04  nan]\n", 0), found.stderr

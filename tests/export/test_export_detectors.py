@@ -1,18 +1,18 @@
 """Exported detectors and encoders of scans, against those of jaxsense."""
 
 import dataclasses
+import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from exporting import ABSENT, CONFIG, played
+from exporting import CONFIG, played
 from smoke import save_models
 
 from jaxsense import export
 from jaxsense.config import PRESETS, LocalisationConfig, SearchConfig
 from jaxsense.core.types import Belief
-from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.interfaces import robot
 from jaxsense.interfaces.onboard import functions
 from jaxsense.models import init, make_readout
 from jaxsense.run.rundir import RunDirectory, Settings
@@ -22,8 +22,7 @@ from jaxsense.sim import windows as windowing
 BATCH = 12
 
 
-@pytest.mark.parametrize("player", [*ABSENT])
-def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, player):
+def test_an_exported_detector_answers_what_is_not_there(file, tmp_path):
     given, expected = {}, {}
     for sensor in sensors.make(CONFIG):
         name = f"detect_{sensor.name}"
@@ -45,7 +44,7 @@ def test_an_exported_detector_answers_what_is_not_there(file, tmp_path, player):
         given[f"{name}/readings"] = np.stack([readings for readings, _, _ in cases])
         given |= {f"{name}/{key}": np.float32([x[key] for _, x, _ in cases]) for key in at}
         expected[name] = np.array([is_there for _, _, is_there in cases])
-    found = played(file, player, given, tmp_path)
+    found = played(file, given, tmp_path)
     for name, is_there in expected.items():
         np.testing.assert_array_equal(found[f"{name}/is_there"], is_there)
         features = found[f"{name}/features"]
@@ -83,14 +82,12 @@ def test_encoders_of_scans_give_what_jaxsense_gives(tmp_path):
 
         expected[name] = np.asarray(jax.jit(jax.vmap(features))(scans, bearings))
         assert np.ptp(expected[name], axis=0).max() > 1e-3
-    for player in ABSENT:
-        found = played(path, player, given, tmp_path)
-        for name, each in expected.items():
-            np.testing.assert_allclose(found[f"{name}/features"], each, atol=1e-5)
+    found = played(path, given, tmp_path)
+    for name, each in expected.items():
+        np.testing.assert_allclose(found[f"{name}/features"], each, atol=1e-5)
 
 
-@pytest.mark.parametrize("player", [robot_numpy, pytest.param(robot_onnx, marks=pytest.mark.slow)])
-def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
+def test_an_exported_robot_searches_as_missions_do(models):
     errors = SearchConfig(position=0.06, heading=3.0)
     localisation = LocalisationConfig(search=errors)
     config = dataclasses.replace(
@@ -106,9 +103,7 @@ def test_an_exported_robot_searches_as_missions_do(models, player, tmp_path):
         for each in models.detectors
     )
     models = dataclasses.replace(models, detectors=unsure)
-    path = tmp_path / "searching.zip"
-    path.write_bytes(export.archive(config, models))
-    _, programs = player.load(path)
+    _, programs = robot.load(io.BytesIO(export.archive(config, models)))
     rng = np.random.default_rng(0)
     for m, sensor in enumerate(sensors.make(config)):
 

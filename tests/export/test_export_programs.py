@@ -1,17 +1,16 @@
 """Exported programs, against jaxsense, in processes that can import neither jaxsense nor JAX."""
 
-import io
 import json
 import zipfile
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnx
 import pytest
-from exporting import ABSENT, CONFIG, played
+from exporting import CONFIG, played
 
 from benchmarks import exported, moments
-from jaxsense import export
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, team_mdp
@@ -27,7 +26,7 @@ SIZES = {"pois": 3, "robots": 2, "looks": 4}
 
 @pytest.fixture(scope="module")
 def results(file, tmp_path_factory):
-    """`{NAME/KEY: array}` of what all programs were given, and what each player's gave."""
+    """`{NAME/KEY: array}` of what all programs were given, and what they gave."""
     rng, inputs = np.random.default_rng(0), {}
     for name, function in functions(CONFIG).items():
         for key, each in function.inputs.items():
@@ -41,19 +40,18 @@ def results(file, tmp_path_factory):
             drawn = rng.integers(0, 2, (BATCH, *shape)) if each.dtype == "int32" else drawn
             inputs[f"{name}/{key}"] = drawn.astype(each.dtype)
     folder = tmp_path_factory.mktemp("results")
-    return inputs, {player: played(file, player, inputs, folder) for player in ABSENT}
+    return inputs, played(file, inputs, folder)
 
 
 def check(results, name, expected, *keys):
     """`expected(*inputs of one example) -> outputs`, for each of the batch."""
-    inputs, of_players = results
+    inputs, outputs = results
     given = [value for key, value in inputs.items() if key.startswith(f"{name}/")]
     for row in range(BATCH):
         values = expected(*(x[row] for x in given))
         for key, value in zip(keys, values, strict=True):
-            for player, outputs in of_players.items():
-                found, place = outputs[f"{name}/{key}"][row], f"{player}: {name}/{key}"
-                np.testing.assert_allclose(found, value, atol=1e-5, err_msg=place)
+            place = f"{name}/{key}"
+            np.testing.assert_allclose(outputs[place][row], value, atol=1e-5, err_msg=place)
 
 
 @pytest.mark.parametrize("m", [0, 1])
@@ -132,8 +130,7 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, results):
         return won.get(robot, nearest), values
 
     check(results, "decide", decide, "action", "values")
-    for outputs in results[1].values():
-        assert len(set(outputs["decide/action"].tolist())) > 1
+    assert len(set(results[1]["decide/action"].tolist())) > 1
 
 
 @pytest.mark.parametrize(
@@ -167,26 +164,21 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
 @pytest.mark.slow
 def test_decisions_are_those_of_missions(models, file):
     found = moments.choices(CONFIG, models, 60)
-    compared = exported.compare(CONFIG, models, file.read_bytes(), found)
-    assert {*compared} == {"NumPy", "onnxruntime"}
-    for programs in compared.values():
-        assert programs["decide"].states == len(found)
-        assert {"classify", "decide", "write_camera", "detect_lidar"} < {*programs}
-        assert all(each.different == 0 for each in programs.values())
-        assert all(each.error < 1e-5 for each in programs.values())
+    programs = exported.compare(CONFIG, models, file.read_bytes(), found)
+    assert programs["decide"].states == len(found)
+    assert {"classify", "decide", "write_camera", "detect_lidar"} < {*programs}
+    assert all(each.different == 0 for each in programs.values())
+    assert all(each.error < 1e-5 for each in programs.values())
 
 
 def test_contents_describe_what_is_there(results, file):
     with zipfile.ZipFile(file) as files:
         contents, names = json.loads(files.read("contents.json")), {*files.namelist()}
-        weights = np.load(io.BytesIO(files.read("weights.npz")))
-        kernel = weights["q_networks/0/params/Dense_0/kernel"]
-    others = {"contents.json", "programs.json", "weights.npz", *(x.name for x in export.FILES)}
-    assert {"robot_numpy.py", "robot_onnx.py", "resampling.py"} < others
-    assert {f"{name}.onnx" for name in contents["programs"]} | others == names
-    inputs, of_players = results
-    ends = [("inputs", inputs), *(("outputs", outputs) for outputs in of_players.values())]
-    for end, given in ends:
+        graph = onnx.load_model_from_string(files.read("decide.onnx")).graph
+    weights = {each.name: tuple(each.dims) for each in graph.initializer}
+    # Data alone.
+    assert {f"{name}.onnx" for name in contents["programs"]} | {"contents.json"} == names
+    for end, given in zip(("inputs", "outputs"), results, strict=True):
         described = {
             f"{name}/{key}": ([BATCH, *(SIZES.get(n, n) for n in about["shape"])], about["dtype"])
             for name, program in contents["programs"].items()
@@ -194,7 +186,8 @@ def test_contents_describe_what_is_there(results, file):
         }
         assert described == {key: (list(x.shape), x.dtype.name) for key, x in given.items()}
         assert all(x["about"] for p in contents["programs"].values() for x in p[end].values())
-    assert kernel.shape[0] == 12  # three PoIs, two latent dimensions
+    # Three PoIs, two latent dimensions.
+    assert weights["q_networks/0/params/Dense_0/kernel"][0] == 12
     assert contents["labels"] == {"camera": ["red", "green"], "lidar": ["cylinder", "cube"]}
     assert contents["classes"] == list(CONFIG.arena.classes)
     for sensor in sensors.make(CONFIG):

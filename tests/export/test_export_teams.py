@@ -13,7 +13,7 @@ from jaxsense import export
 from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief
 from jaxsense.dqn.team_mdp import Team
-from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.interfaces.robot import load
 from jaxsense.models import init
 
 
@@ -29,11 +29,10 @@ def team(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_a_team_may_have_any_number_of_points_and_robots(team, player):
+def test_a_team_may_have_any_number_of_points_and_robots(team):
     _, trained, path = team
     assert trained.agent.orders
-    contents, programs = player.load(path)
+    contents, programs = load(path)
     about = contents["programs"]["decide"]
     assert about["outputs"]["values"]["shape"] == ["pois + 1"]
     for num_pois, num_robots, num_looks in ((5, 3, 2), (2, 1, 1), (9, 4, 32)):
@@ -67,21 +66,19 @@ def test_a_team_may_have_any_number_of_points_and_robots(team, player):
 @pytest.mark.slow
 def test_a_value_that_is_not_a_number_is_answered_by_minus_one(team):
     _, _, path = team
-    for player in (robot_numpy, robot_onnx):
-        contents, programs = player.load(path)
-        given = {
-            name: np.ones([{"pois": 2}.get(n, n if isinstance(n, int) else 1) for n in x["shape"]])
-            for name, x in contents["programs"]["decide"]["inputs"].items()
-        }
-        given["robot"] = 0
-        assert programs["decide"](**given)["action"] >= 0
-        given["mean"][1, 0] = np.nan
-        assert programs["decide"](**given)["action"] == -1
+    contents, programs = load(path)
+    given = {
+        name: np.ones([{"pois": 2}.get(n, n if isinstance(n, int) else 1) for n in x["shape"]])
+        for name, x in contents["programs"]["decide"]["inputs"].items()
+    }
+    given["robot"] = 0
+    assert programs["decide"](**given)["action"] >= 0
+    given["mean"][1, 0] = np.nan
+    assert programs["decide"](**given)["action"] == -1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", [robot_numpy, robot_onnx])
-def test_the_example_plays_a_team(team, player):
-    lines = runpy.run_path(str(EXAMPLE))["explore"](*player.load(team[2]), [0, 1, 2, 0])
+def test_the_example_plays_a_team(team):
+    lines = runpy.run_path(str(EXAMPLE))["explore"](*load(team[2]), [0, 1, 2, 0])
     assert [line.split(" is a ")[0] for line in lines[-4:]] == [f"PoI {n}" for n in range(4)]
     assert any("looks at PoI" in line for line in lines)

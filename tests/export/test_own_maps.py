@@ -17,7 +17,7 @@ from jaxsense.config import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.interfaces import robot_numpy, robot_onnx
+from jaxsense.interfaces.robot import load
 from jaxsense.mission import memory
 from jaxsense.mission.maps import OwnMap
 from jaxsense.vae import readout
@@ -30,7 +30,6 @@ OWN = dataclasses.replace(
         CONFIG.mission, communication=CommunicationConfig(own_maps=True, loss=0.3, delay=1.0)
     ),
 )
-PLAYERS = [robot_numpy, robot_onnx]
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +55,9 @@ def archive(models):
     return export.archive(OWN, models)
 
 
-@pytest.mark.parametrize("player", PLAYERS)
-def test_maps_are_merged_as_missions_merge_them(models, archive, player):
+def test_maps_are_merged_as_missions_merge_them(models, archive):
     """Three robots look at five PoIs; the first one has heard of some looks of the others."""
-    _, programs = player.load(io.BytesIO(archive))
+    _, programs = load(io.BytesIO(archive))
     assert not {"write_camera", "write_lidar"} & {*programs}
     rng, modality = np.random.default_rng(0), np.array([0, 1, 1], np.int32)
     held, sums = memory.empty(jnp.asarray(modality), 3), np.zeros((3, 5, 3), np.float32)
@@ -96,20 +94,18 @@ def test_maps_are_merged_as_missions_merge_them(models, archive, player):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("player", PLAYERS)
-def test_the_example_plays_robots_with_maps_of_their_own(archive, player):
+def test_the_example_plays_robots_with_maps_of_their_own(archive):
     example = runpy.run_path(str(EXAMPLE))
-    contents, programs = player.load(io.BytesIO(archive))
+    contents, programs = load(io.BytesIO(archive))
     assert contents["remembered_looks"] == memory.MOST_LOOKS
     lines = example["explore"](contents, programs, [0, 1, 2])
     assert [line.split(" is a ")[0] for line in lines[-3:]] == [f"PoI {n}" for n in range(3)]
     assert any("looks at PoI" in line for line in lines)
 
 
-@pytest.mark.parametrize("player", [robot_numpy])
-def test_a_message_that_comes_twice_is_counted_once(archive, player):
+def test_a_message_that_comes_twice_is_counted_once(archive):
     example = runpy.run_path(str(EXAMPLE))
-    contents, programs = player.load(io.BytesIO(archive))
+    contents, programs = load(io.BytesIO(archive))
     maps = [example["empty"](contents, 3) for _ in range(2)]
     place = np.array([0.5, 0.2], np.float32)
     maps[0]["sums"][0, 1] = [0.0, -2.0, -3.0]
@@ -127,15 +123,15 @@ def test_a_message_that_comes_twice_is_counted_once(archive, player):
 @pytest.mark.slow
 def test_decisions_by_own_maps_are_those_of_missions(models, archive):
     found = moments.choices(OWN, models, 60)
-    _, programs = robot_numpy.load(io.BytesIO(archive))
+    _, programs = load(io.BytesIO(archive))
     for choice in found:
         merged = programs["merge"](sums=choice.sums)
         np.testing.assert_allclose(merged["mean"], choice.inputs["mean"], atol=1e-5)
         np.testing.assert_allclose(merged["std"], choice.inputs["std"], atol=1e-5)
     assert any(np.any(choice.sums != 0) for choice in found)
-    for each in exported.compare(OWN, models, archive, found).values():
-        assert {"decide", "merge", "tell_camera", "tell_lidar"} < {*each}
-        assert all(program.different == 0 for program in each.values())
-        # The class probabilities of a belief after one look are read with rounding, see the page.
-        limits = {name: 1e-4 if name.startswith("tell") else 1e-5 for name in each}
-        assert all(program.error < limits[name] for name, program in each.items())
+    each = exported.compare(OWN, models, archive, found)
+    assert {"decide", "merge", "tell_camera", "tell_lidar"} < {*each}
+    assert all(program.different == 0 for program in each.values())
+    # The class probabilities of a belief after one look are read with rounding, see the page.
+    limits = {name: 1e-4 if name.startswith("tell") else 1e-5 for name in each}
+    assert all(program.error < limits[name] for name, program in each.items())

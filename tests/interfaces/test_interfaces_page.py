@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from archives import imports_from_archives
 
 from jaxsense import export
 
@@ -48,8 +47,7 @@ def test_examples_run(names, package, tmp_path, monkeypatch, capsys):
         importlib.import_module("torch").set_num_threads(1)  # more get into each other's way
     if package == "onnx":
         Path("robot.zip").write_bytes(export.archive(names["config"], names["models"]))
-    with imports_from_archives():
-        exec(compile(example, PAGE.name, "exec"), dict(names))
+    exec(compile(example, PAGE.name, "exec"), dict(names))
     (printed,) = re.findall(r"^print\(.*\)  # (.*)$", example, re.MULTILINE)
     assert capsys.readouterr().out == f"{printed}\n"
 

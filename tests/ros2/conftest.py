@@ -4,8 +4,6 @@ from pathlib import Path
 import pytest
 from ros2_robot import CONTENTS, POSITIONS, Stub
 
-from jaxsense.sim import resampling
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -23,4 +21,4 @@ def stub():
 
 @pytest.fixture
 def robot(ros2, stub):
-    return ros2.Robot(CONTENTS, stub.programs(), resampling, 1, POSITIONS)
+    return ros2.Robot(CONTENTS, stub.programs(), 1, POSITIONS)

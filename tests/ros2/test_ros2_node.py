@@ -8,8 +8,6 @@ import pytest
 from ros2_messages import LaserScan
 from ros2_robot import CONTENTS, OWN, POSITIONS, arrive, see
 
-from jaxsense.sim import resampling
-
 
 def test_a_scan_from_left_to_right_is_turned(ros2, robot, stub):
     ranges = np.linspace(1, 3, 9)
@@ -41,7 +39,6 @@ def test_single_lost_beams_take_the_distance_of_their_neighbours(ros2, robot, st
 
 
 def test_a_scanner_that_is_too_coarse_is_refused_before_the_robot_drives(ros2, robot, stub):
-    assert ros2.MAX_STEPS == resampling.MAX_STEPS
     # The run's beams are 10 degrees apart; from left to right, as some drivers have it.
     for step, is_dense in ((29.9, True), (30.1, False)):
         angles = np.radians(100 - step * np.arange(6))
@@ -67,7 +64,7 @@ def test_the_goal_is_the_nearest_viewpoint(robot):
 
 
 def test_the_goal_is_not_where_another_robot_is(ros2, robot, stub):
-    other = ros2.Robot(CONTENTS, stub.programs(), resampling, 0, POSITIONS)
+    other = ros2.Robot(CONTENTS, stub.programs(), 0, POSITIONS)
     arrive(other, (1.1, 0.1, 0.0))
     robot.hear(0.0, other.report())
     goal = arrive(robot)
@@ -151,7 +148,7 @@ def test_a_look_updates_the_map_and_the_next_choice_is_new(ros2, robot, stub):
 
 def test_a_robot_under_way_keeps_its_viewpoint_unless_it_changes_its_mind(ros2, robot, stub):
     goal = arrive(robot)
-    report = ros2.Robot(CONTENTS, stub.programs(), resampling, 0, POSITIONS).report()
+    report = ros2.Robot(CONTENTS, stub.programs(), 0, POSITIONS).report()
     look = {"poi": 2, "features": [0.75, 0.25], "weight": 1.0, "place": [-1.1, 0.0]}
     told = report.replace('"look": null', f'"look": {look}'.replace("'", '"'))
     robot.hear(0.0, told)
@@ -203,17 +200,17 @@ def test_a_robot_ends_by_nop(robot, stub):
 
 def test_an_archive_that_does_not_fit_is_named(ros2, stub):
     with pytest.raises(ValueError, match="2 PoIs: the policy of this archive is for 3"):
-        ros2.Robot(CONTENTS, stub.programs(), resampling, 1, POSITIONS[:2])
+        ros2.Robot(CONTENTS, stub.programs(), 1, POSITIONS[:2])
     programs = {**stub.programs(), "merge": None}
     with pytest.raises(ValueError, match="maps of their own"):
-        ros2.Robot(CONTENTS, programs, resampling, 1, POSITIONS)
+        ros2.Robot(CONTENTS, programs, 1, POSITIONS)
 
 
 @pytest.mark.parametrize("index", [-1, 2])
 def test_a_robot_that_the_archive_lacks_is_named(ros2, stub, index):
     expected = f"robot = {index}: must be one of {{0: 'camera', 1: 'lidar'}}"
     with pytest.raises(ValueError, match=re.escape(expected)):
-        ros2.Robot(CONTENTS, stub.programs(), resampling, index, POSITIONS)
+        ros2.Robot(CONTENTS, stub.programs(), index, POSITIONS)
 
 
 @pytest.mark.parametrize(
@@ -226,4 +223,4 @@ def test_a_robot_that_the_archive_lacks_is_named(ros2, stub, index):
 )
 def test_places_of_no_pois_are_named(ros2, stub, positions, expected):
     with pytest.raises(ValueError, match=rf"positions = \[\[0.0, 1.0.*: {expected}"):
-        ros2.Robot(CONTENTS, stub.programs(), resampling, 1, np.array(positions))
+        ros2.Robot(CONTENTS, stub.programs(), 1, np.array(positions))

@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from archives import imports_from_archives
 
 import jaxsense
 from jaxsense import export, sim
 
 
 def run_node(ros2, monkeypatch, *argv):
-    """Why the program ends where there is no ROS, and with what it loads a robot."""
+    """Why the program ends where there is no ROS, and with what it makes a robot."""
     given = []
-    monkeypatch.setattr(ros2, "load", lambda *each: given.append(each))
+    monkeypatch.setattr(ros2, "load", lambda archive: (archive, "programs"))
+    monkeypatch.setattr(ros2, "Robot", lambda *each: given.append(each))
     monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", *argv])
     monkeypatch.setitem(ros2.sys.modules, "rclpy", None)
     with pytest.raises(SystemExit) as stop:
@@ -28,7 +28,7 @@ def test_the_program_reads_its_command_before_it_needs_ros(ros2, monkeypatch):
     ros = ["--ros-args", "-r", "scan:=/front/scan"]
     ended, given = run_node(ros2, monkeypatch, "robot.zip", "--robot", "-1", *pois, *ros)
     assert ended == "needs ROS 2: source /opt/ros/.../setup.bash"
-    ((archive, robot, positions),) = given
+    ((archive, _, robot, positions),) = given
     assert (archive, robot) == (Path("robot.zip"), -1)
     np.testing.assert_array_equal(positions, [[1.0, 0.5], [-1.2, 0.8], [-0.3, -1.1]])
 
@@ -44,9 +44,10 @@ def test_the_program_refuses_what_is_no_place(ros2, monkeypatch, capsys, poi):
 def test_the_program_refuses_what_is_no_archive(ros2, monkeypatch, capsys, tmp_path):
     text = tmp_path / "text.zip"
     text.write_text("no archive")
-    for file, words in ((text, "must be a file of `jaxsense export`"), ("x.zip", "no such file")):
+    not_there = "cannot be read (no such file)"
+    for file, words in ((text, "must be a file of `jaxsense export`"), ("x.zip", not_there)):
         monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", str(file), "--pois", "0,1"])
-        with imports_from_archives(), pytest.raises(SystemExit):
+        with pytest.raises(SystemExit):
             ros2.main()
         assert f"{file}: {words}" in capsys.readouterr().err
 
@@ -59,8 +60,7 @@ def test_a_team_of_nodes_finds_out_what_stands_where(ros2, tmp_path):
     world, classes = sim.make_world(config), [2, 0, 1]
     scene = sim.random_scene(jax.random.key(0), world, jnp.array(classes))
     positions = np.asarray(scene.layout.position)
-    with imports_from_archives():
-        team = [ros2.load(archive, robot, positions) for robot in range(2)]
+    team = [ros2.Robot(*ros2.load(archive), robot, positions) for robot in range(2)]
     poses, number = np.array(scene.poses, float), 0
 
     @jax.jit

@@ -14,11 +14,9 @@ import pytest
 from ros2_messages import LaserScan
 from ros2_robot import CONTENTS, OWN, POSITIONS, arrive, see
 
-from jaxsense.sim import resampling
-
 
 def test_robots_tell_each_other_their_looks(ros2, robot, stub):
-    other = ros2.Robot(CONTENTS, stub.programs(), resampling, 0, POSITIONS)
+    other = ros2.Robot(CONTENTS, stub.programs(), 0, POSITIONS)
     look = see(ros2, robot, goal := arrive(robot))
     robot.choose(1.0, goal)
     for hears in (other, robot):  # its own report changes nothing

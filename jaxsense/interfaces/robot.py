@@ -1,11 +1,12 @@
 """Runs an exported run with onnxruntime: copy this file and the archive to a robot.
 
-    from robot_onnx import load
+    from robot import load
     contents, programs = load("robot.zip")
     programs["decide"](mean=..., std=..., ...)  # {"action": ..., "values": ...}
 
-`contents` describes the inputs and outputs of each program. In C++, load `NAME.onnx` from the
-archive with `Ort::Session`, and give and take tensors of the same names, shapes and types.
+`contents` describes the inputs and outputs of each program. An archive holds data alone. In C++,
+load `NAME.onnx` from it with `Ort::Session`, and give and take tensors of the same names, shapes
+and types.
 """
 
 import json
@@ -18,6 +19,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import onnxruntime
 from numpy.typing import ArrayLike
+
+MOST_BYTES, MOST_TEXT = 2**27, 2**22
+"""Bytes of an unpacked archive and of its `contents.json`: those of presets hold 1 % of them."""
+_DTYPES = {"tensor(float)": "float32", "tensor(int32)": "int32", "tensor(bool)": "bool"}
 
 Arrays = dict[str, np.ndarray]
 Program = Callable[..., Arrays]
@@ -33,18 +38,32 @@ def load(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, Program
       Its `contents.json`, and its programs by name: from arrays by name to arrays by name.
 
     Raises:
-      ValueError: if it is no archive.
+      ValueError: if it cannot be read, is no archive, is damaged or is too large.
     """
     try:
-        with zipfile.ZipFile(path) as files:
-            contents = json.loads(files.read("contents.json"))
-            models = {name: files.read(f"{name}.onnx") for name in contents["programs"]}
-    except (KeyError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: must be a file of `jaxsense export` ({error})") from error
-    described = contents["programs"]
-    return contents, {
-        name: _program(name, model, described[name]) for name, model in models.items()
-    }
+        contents, models = _read(path)
+        return contents, {
+            name: _program(name, models[name], about)
+            for name, about in contents["programs"].items()
+        }
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # zipfile, zlib, json and onnxruntime have no base class in common
+        must_be = "must be a file of `jaxsense export`"
+        raise ValueError(f"{path}: {must_be} ({error!r:.300})") from error
+
+
+def _read(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Content of `contents.json`, and the ONNX file of each program."""
+    if isinstance(path, str | Path) and not Path(path).is_file():
+        raise FileNotFoundError("no such file")
+    with zipfile.ZipFile(path) as files:
+        text, whole = files.getinfo("contents.json"), sum(x.file_size for x in files.infolist())
+        for size, most in ((text.file_size, MOST_TEXT), (whole, MOST_BYTES)):
+            if size > most:
+                raise ValueError(f"{size} bytes when unpacked: must be at most {most}")
+        contents = json.loads(files.read(text))
+        return contents, {name: files.read(f"{name}.onnx") for name in contents["programs"]}
 
 
 def checked(
@@ -109,8 +128,12 @@ def _program(name: str, model: bytes, about: Mapping[str, Any]) -> Program:
     options = onnxruntime.SessionOptions()
     # The programs are small: more threads than one would wait for each other.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3  # errors
+    options.log_severity_level = 4  # fatal errors; others are raised
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    for ends, found in (("inputs", session.get_inputs()), ("outputs", session.get_outputs())):
+        described = {key: (each["dtype"], each["shape"]) for key, each in about[ends].items()}
+        if described != {each.name: (_DTYPES.get(each.type), each.shape) for each in found}:
+            raise ValueError(f"{name}.onnx has other {ends} than contents.json")
     outputs = [*about["outputs"]]
 
     def program(*unnamed: object, **given: ArrayLike) -> Arrays:
