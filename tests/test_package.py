@@ -73,6 +73,12 @@ def test_examples_of_single_functions_run(capsys):
 @pytest.mark.slow
 def test_example_of_the_jmvae_on_own_data_runs(capsys):
     names = run_example(ROOT / "docs" / "jmvae.md")
+    # A float64 column at 1e6 +- 1 and one at 2,000 +- 3 have a deviation of 1 afterwards.
+    far = np.random.default_rng(0).normal([1e6, 2e3], [1.0, 3.0], (5000, 2))
+    scaled = names["standardize"](far)
+    np.testing.assert_allclose(scaled.mean(axis=0), 0.0, atol=1e-5)
+    np.testing.assert_allclose(scaled.std(axis=0), 1.0, rtol=1e-5)
+    assert scaled.dtype == np.float32
     assert names["losses"][-50:].mean() < 0.5 * names["losses"][:50].mean()
     shapes, share, likelihood = capsys.readouterr().out.splitlines()
     assert shapes == "(200, 2) (200, 2)"

@@ -259,12 +259,13 @@ def retrain(
       config: batch, learning rate, steps, and the share of windows to keep, `calibration`; static.
 
     Returns:
-      The detector with other parameters; its gate is the same.
+      The detector with other parameters; its gate is the same. Inside `jit`, which raises no error,
+      all parameters are NaN if the training or its windows are not finite.
 
     Raises:
       TypeError: if the detector is an encoder of scans, which learns without labels.
-      ValueError: if windows are not finite, a label is none of the detector's, or
-        `config.calibration` leaves no window to train with, or none to judge by.
+      ValueError: if windows are not finite, a label is none of the detector's, the training
+        diverges, or `config.calibration` leaves no window to train with, or none to judge by.
     """
     checks.require_key(key)
     if not isinstance(detector, Classifier):
@@ -289,7 +290,9 @@ def retrain(
 
     shares = jnp.linspace(0.0, 1.0, 21)
     losses = jax.lax.map(lambda share: judge.loss(moved(share), kept, fit.step), shares)
-    return dataclasses.replace(detector, params=moved(shares[jnp.argmin(losses)]))
+    checks.require_finite("loss of retrained detectors", losses, "must be finite; retrain slower")
+    best = jnp.where(jnp.isfinite(losses).all(), shares[jnp.argmin(losses)], jnp.nan)
+    return dataclasses.replace(detector, params=moved(best))
 
 
 def calibrate(

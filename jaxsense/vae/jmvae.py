@@ -357,7 +357,8 @@ def train(
         a constant.
 
     Returns:
-      The parameters and the `[steps]` losses.
+      The parameters and the `[steps]` losses, of which the last is NaN if a parameter is not
+      finite: inside `jit`, which raises no error, check the losses.
 
     Raises:
       ValueError: if a modality has no features, or some of another shape or not finite, or if the

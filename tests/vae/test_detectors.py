@@ -208,6 +208,15 @@ def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
     assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01
 
 
+@pytest.mark.parametrize("row", [3, 190])  # of the windows to train with, and to judge by
+def test_retraining_that_is_not_finite_says_so(trained, row):
+    windows, labels = synthetic_windows(jax.random.key(8), 200)
+    found = retrain(jax.random.key(9), trained[1], windows.at[row, 0].set(jnp.nan), labels)
+    assert all(np.isnan(x).all() for x in jax.tree.leaves(found.params))
+    with pytest.raises(ValueError, match=r"^loss of retrained detectors = (nan|inf): must be fin"):
+        detectors.retrain(jax.random.key(9), trained[1], 5e37 * windows, labels)
+
+
 @pytest.mark.parametrize(("calibration", "number"), [(0.0, 10), (0.5, 1)])
 def test_windows_to_train_with_and_to_judge_by_are_needed(trained, calibration, number):
     config = replace(detectors.RETRAINING, calibration=calibration)

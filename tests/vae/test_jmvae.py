@@ -258,6 +258,20 @@ def test_every_step_of_a_training_draws_anew(steps):
     assert len(np.unique(losses)) == len(losses) == steps
 
 
+@pytest.mark.parametrize("steps", [20, 230])  # in one chunk, and in the middle of the third
+def test_losses_say_under_jit_that_parameters_are_not_finite(steps):
+    config = JmvaeConfig(hidden=(8,), steps=steps, batch=64)
+    bank = [jax.random.uniform(k, (3, 50, 2)) for k in jax.random.split(jax.random.key(1))]
+    bank[0] = bank[0].at[1, 7].set(jnp.nan)
+    train = jax.jit(jmvae.train, static_argnums=2)
+    params, losses = train(
+        jax.random.key(2), init(jax.random.key(0), TWO), TWO, tuple(bank), config
+    )
+    assert not all(np.isfinite(x).all() for x in jax.tree.leaves(params))
+    assert np.isnan(losses[-1])
+    assert not np.isfinite(losses).all()
+
+
 def test_gradient_of_the_loss_agrees_with_finite_differences():
     with jax.enable_x64(True):
         model = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))

@@ -1,0 +1,224 @@
+"""The looks that a detector has learned from, and what detection says of others."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsense
+from jaxsense.config import PRESETS, LocalisationConfig
+from jaxsense.sim import resampling, sensors, windows
+from jaxsense.sim.domain import make_domain
+
+CONFIG = PRESETS["smoke"]
+CAMERA, LIDAR = sensors.make(CONFIG)
+DOMAINS = [make_domain(CONFIG, sensor) for sensor in (CAMERA, LIDAR)]
+MODELS = jaxsense.init(jax.random.key(0), CONFIG)
+TURN = 2 * np.pi
+
+
+def test_limits_are_those_of_the_settings():
+    of_camera, of_lidar = DOMAINS
+    np.testing.assert_allclose(of_lidar.distance, [0.3, 1.2], rtol=1e-6)
+    # 683 beams over 240 degrees; of 640 pixels with a focal length of 320 / tan(40 degrees), every
+    # fourth: in the middle 4 / 381.4 rad, at the edge less by the squared cosine of 40 degrees.
+    np.testing.assert_allclose(np.degrees(of_lidar.step), 240 / 682, rtol=1e-4)
+    middle = 4 / (320 / np.tan(np.radians(40)))
+    expected = [middle * np.cos(np.radians(40)) ** 2, middle]
+    np.testing.assert_allclose(of_camera.step, expected, rtol=0.01)
+    # The camera's pixels lie otherwise beyond 20 degrees and an error of 1; the LiDAR's window of
+    # 128 beams may be anywhere in 120 degrees to either side.
+    np.testing.assert_allclose(np.degrees(of_camera.bearing), [-21, 21], rtol=1e-5)
+    limit = 120 - 64 * 240 / 682
+    np.testing.assert_allclose(np.degrees(of_lidar.bearing), [-limit, limit], rtol=1e-4)
+    np.testing.assert_allclose([of_camera.range, of_lidar.range], [[1, 1], [1.5, 1.5]])
+
+
+def test_errors_of_poses_in_training_widen_the_limits():
+    errors = LocalisationConfig(in_training=True, position_error=0.02, heading_error=1.0)
+    mission = dataclasses.replace(CONFIG.mission, localisation=errors)
+    found = make_domain(dataclasses.replace(CONFIG, mission=mission), CAMERA)
+    np.testing.assert_allclose(found.distance, [0.24, 1.26], rtol=1e-5)
+    np.testing.assert_allclose(np.degrees(found.bearing), [-24, 24], rtol=1e-5)
+
+
+def changed(sensor, **changes):
+    make = {"camera": sensors.camera, "lidar": sensors.lidar}[sensor.name]
+    return make(dataclasses.replace(sensor.config, **changes))
+
+
+FINE = changed(LIDAR, num_beams=1365), changed(CAMERA, num_pixels=1280)
+FAR = changed(LIDAR, window_range=3.0)
+
+
+@pytest.mark.parametrize(
+    ("m", "sensor", "bearing", "distance", "expected"),
+    [
+        (1, LIDAR, 0.2, 0.3, True),
+        (1, LIDAR, 0.2, 1.2, True),
+        (1, LIDAR, 0.2, 0.29, False),
+        (1, LIDAR, 0.2, 1.21, False),
+        (1, LIDAR, 0.2, -1.0, False),
+        (1, LIDAR, 0.2, np.nan, False),
+        (1, LIDAR, 0.2, np.inf, False),
+        (1, LIDAR, 1.69, 1.0, True),
+        (1, LIDAR, 1.71, 1.0, False),
+        (1, LIDAR, -1.71, 1.0, False),
+        (1, LIDAR, 1.69 + TURN, 1.0, True),
+        (1, LIDAR, 1.71 - TURN, 1.0, False),
+        (1, LIDAR, 0.2 - 3 * TURN, 1.0, True),
+        (1, LIDAR, np.nan, 1.0, False),
+        (1, LIDAR, np.inf, 1.0, False),
+        (0, CAMERA, 0.36, 1.0, True),
+        (0, CAMERA, 0.37, 1.0, False),
+        (1, FINE[0], 0.0, 1.0, False),
+        (0, FINE[1], 0.0, 1.0, False),
+        (1, FAR, 0.0, 1.0, False),
+        (1, changed(LIDAR, stride=2), 0.0, 1.0, False),
+        (0, changed(CAMERA, field_of_view=60.0), 0.0, 1.0, False),
+        (1, changed(LIDAR, range_noise=0.03), 0.0, 1.0, True),
+    ],
+)
+def test_a_look_is_known_within_all_limits(m, sensor, bearing, distance, expected):
+    given = sensor, jnp.float32(bearing), jnp.float32(distance)
+    assert bool(DOMAINS[m].contains(*given)) is expected
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Turned:
+    angles: np.ndarray
+
+    def centre(self, bearing):
+        return LIDAR.rays.centre(bearing)
+
+
+def test_an_unevenly_spaced_sensor_is_not_the_one_that_was_learned():
+    odd = np.arange(683) % 2
+    rays = Turned(LIDAR.angles + np.float32(0.002) * odd)
+    assert not DOMAINS[1].contains(LIDAR.replace(rays=rays), jnp.float32(0), jnp.float32(1))
+    even = LIDAR.replace(rays=Turned(LIDAR.angles))
+    assert DOMAINS[1].contains(even, jnp.float32(0), jnp.float32(1))
+
+
+def test_a_sensor_of_one_ray_has_a_domain():
+    sensor = changed(LIDAR, num_beams=1, window=1)
+    found = make_domain(CONFIG, sensor)
+    assert sensor.steps == (0.0, 0.0)
+    assert bool(found.contains(sensor, jnp.float32(0), jnp.float32(1)))
+
+
+def test_whole_turns_leave_a_bearing_as_it_is():
+    bearings = np.float32([-np.pi, -3.0, -0.2, 0.0, 0.2, 1.5, 3.0])
+    np.testing.assert_array_equal(windows.wrapped(jnp.asarray(bearings)), bearings)
+    turned = windows.wrapped(jnp.asarray(bearings[1:] + np.float32(TURN)))
+    np.testing.assert_allclose(turned, bearings[1:], atol=1e-6)
+
+
+SCANS = {"camera": np.full((640, 3), 0.5, np.float32), "lidar": np.full(683, 1.0, np.float32)}
+
+
+def changed_scan(sensor, reading):
+    scan = SCANS[sensor.name].copy()
+    scan[len(scan) // 2 : len(scan) // 2 + 4] = reading  # the camera reads every fourth pixel
+    return scan
+
+
+@pytest.mark.parametrize(
+    ("m", "reading", "is_known"),
+    [
+        (0, 0.5, True),
+        (0, 1.0, True),
+        (0, 1.5, False),
+        (0, 200.0, False),
+        (0, -0.1, False),
+        (0, np.nan, False),
+        (1, 0.0, True),
+        (1, np.inf, True),
+        (1, 90.0, True),
+        (1, -1.0, False),
+        (1, -np.inf, False),
+        (1, np.nan, False),
+    ],
+)
+def test_a_window_with_a_reading_that_is_none_is_not_known(m, reading, is_known):
+    # An untrained gate passes all that it can judge.
+    sensor = (CAMERA, LIDAR)[m]
+    scan = changed_scan(sensor, reading)
+    found = MODELS.detect(m, sensor, scan, jnp.float32(0.0), jnp.float32(1.0))
+    assert (bool(found.is_known), bool(found.is_there)) == (is_known, is_known)
+    if not is_known:
+        np.testing.assert_array_equal(found.features, 0.5)
+
+
+@pytest.mark.parametrize("m", [0, 1])
+def test_a_bearing_of_a_turn_more_is_the_same_look(m):
+    sensor = (CAMERA, LIDAR)[m]
+    rng = np.random.default_rng(0)
+    scan = rng.uniform(0.3, 0.9, SCANS[sensor.name].shape).astype(np.float32)
+    before, after = (
+        MODELS.detect(m, sensor, scan, bearing, jnp.float32(0.9)) for bearing in (0.2, 0.2 + TURN)
+    )
+    assert bool(after.is_known & after.is_there)
+    np.testing.assert_allclose(after.features, before.features, atol=1e-6)
+    beyond = MODELS.detect(m, sensor, scan, 0.2, jnp.float32(1.3))
+    assert not bool(beyond.is_known | beyond.is_there)
+    np.testing.assert_array_equal(beyond.features, 0.5)
+
+
+def wall(angles):
+    """A wall 2 m ahead, as seen along rays."""
+    return 2 / np.cos(angles)
+
+
+def merged(angles, between):
+    """Three sweeps a little apart."""
+    return np.concatenate([angles + i * between for i in range(3)])
+
+
+AHEAD = np.radians(np.arange(-30, 31))
+UNEVEN = np.radians(np.concatenate([np.arange(-30, 0, 0.1), np.arange(0, 31, 0.5)]))
+
+
+@pytest.mark.parametrize(
+    "angles",
+    [
+        AHEAD,
+        merged(AHEAD, 1e-7),
+        merged(AHEAD, 1e-3),
+        UNEVEN,
+        np.radians(np.arange(-30, 31, 0.1)),
+        np.radians(np.arange(-30, 31, 3.0)),
+    ],
+    ids=["even", "merged", "interlaced", "uneven", "fine", "coarse"],
+)
+def test_scans_along_any_rays_are_read_where_they_were_recorded(angles):
+    rng = np.random.default_rng(0)
+    order = rng.permutation(len(angles))
+    targets = np.radians(np.arange(-29, 30))
+    found = resampling.resample(targets, angles[order], wall(angles)[order], measures_distance=True)
+    # Between rays .0524 rad apart, a straight line is off by at most r'' / 8 of the squared angle:
+    # at 30 degrees 2 (1 + 2 tan^2) / cos / 8 * .0524^2 = .0013 m.
+    np.testing.assert_allclose(found, wall(targets), atol=0.0014)
+    # A lost beam of one sweep, or of an uneven scan, is closed.
+    lost = wall(angles)
+    lost[len(angles) // 2] = np.inf
+    step = resampling.median_step(targets)
+    closed = resampling.close_gaps(angles[order], lost[order], step=step)
+    np.testing.assert_allclose(closed, wall(angles)[order], atol=0.08)
+
+
+def test_a_gap_wider_than_three_steps_of_the_rays_that_are_read_was_not_recorded():
+    targets = np.radians(np.arange(-10.0, 11.0))
+    # Merged sweeps of every 3 degrees were recorded, of every 4 degrees only near their rays.
+    for between, share in ((3.0, 1.0), (4.0, 5 / 21)):
+        angles = merged(np.radians(np.arange(-12.0, 13.0, between)), 1e-7)
+        found = resampling.resample(targets, angles, wall(angles), measures_distance=True)
+        assert np.isfinite(found).mean() == pytest.approx(share)
+        np.testing.assert_array_equal(np.isfinite(found), resampling.covered(targets, angles))
+    # As far apart as is needed.
+    assert resampling.covered(targets, angles, step=np.radians(2.0)).all()
+    # One ray has no step: that of the recorded ones counts.
+    assert resampling.covered(np.zeros(1), np.radians([-5.0, 5.0, 15.0])).all()
+    assert not resampling.covered(np.zeros(1), np.radians([100.0, 101.0, 102.0])).any()
