@@ -144,6 +144,7 @@ class Models:
         return latent.plausible_classes(belief, self.fusion.classes.mean)
 
 
+@checks.typed
 def require_fitting(config: Config, models: Models) -> None:
     """Checks that models can be those of some settings.
 
@@ -155,9 +156,6 @@ def require_fitting(config: Config, models: Models) -> None:
       ValueError: if one is of another type, they are for other classes, or their fusion is no
         `Fusion`.
     """
-    checks.require_type("config", config, Config, "all settings")
-    if not isinstance(models, Models):
-        raise ValueError(f"models = {type(models).__name__}: must be Models, as from jaxsense.load")
     checks.require_members("models.fusion", models.fusion, Fusion)
     if jax.tree_util.all_leaves([models.fusion]):
         kind = type(models.fusion).__name__
@@ -174,7 +172,6 @@ def require_fitting(config: Config, models: Models) -> None:
 @checks.typed
 def make_jmvae(config: Config) -> Jmvae:
     """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
-    checks.require_type("config", config, Config, "all settings")
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
@@ -265,6 +262,7 @@ def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InP
     return fusion.InPlace(params, classes, make_prior(config), read, model)
 
 
+@checks.typed
 def init(key: Key, config: Config) -> Models:
     """Initialises untrained models, to try functions before training.
 

@@ -268,7 +268,7 @@ def naive(number: int) -> Values:
 
 
 def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes every action that exists with equal chance.
+    """Takes every action with equal chance; one that does not exist is no operation in missions.
 
     Args:
       key: random key.
@@ -276,9 +276,8 @@ def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
       known: what the robot knows.
     """
     del models
-    exists = jnp.append(known.team.present, True)
-    drawn = jax.random.randint(key, (), 0, jnp.sum(exists))
-    return jax.nn.one_hot(jnp.argmax(jnp.cumsum(exists) > drawn), len(exists))
+    number = len(known.looks) + 1
+    return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
 
 
 def _by_rule(rule: rules.Rule) -> Values:

@@ -264,7 +264,6 @@ def make_mission(
     Raises:
       ValueError: if `arenas` were compiled from other settings than `config.arena`.
     """
-    checks.require_type("config", config, Config, "all settings")
     arena, free = (None, None) if arenas is None else arenas
     return Mission(
         world=worlds.make_world(config, config.carried, arena=arena, contacts=contacts),

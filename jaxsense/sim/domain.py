@@ -45,8 +45,9 @@ class Domain:
         """
         least, most = sensor.steps
         look = jnp.stack([distance, windows.wrapped(bearing), least, most, sensor.window_limit])
-        low, high = jnp.stack([self.distance, self.bearing, self.step, self.step, self.range]).T
-        return jnp.all((look >= low - _ROUNDING) & (look <= high + _ROUNDING))
+        limits = jnp.stack([self.distance, self.bearing, self.step, self.step, self.range])
+        is_within = (look >= limits[:, 0] - _ROUNDING) & (look <= limits[:, 1] + _ROUNDING)
+        return jnp.all(is_within)
 
 
 def make_domain(config: Config, sensor: Sensor) -> Domain:

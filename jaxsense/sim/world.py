@@ -76,7 +76,6 @@ def make_world(
       ValueError: if `arena` was compiled from other settings than `config.arena`.
       ConfigError: if a custom sensor is wrong, see `sensors.make`.
     """
-    checks.require_type("config", config, Config, "all settings")
     if arena is None:
         on_top = sensors.on_top(config, robots or config.modalities)
         arena = arenas.build(config.arena, on_top, contacts=contacts)

@@ -139,7 +139,7 @@ FUNCTIONS = {
     **{
         f"{name} {config}": (
             lambda w, call=call, config=config: call(w, config),
-            f"config = {config!r}: must be Config, all settings",
+            f"config = {config!r}: must be Config, of jaxsense.config.whole",
         )
         for name, call in {
             "init": lambda w, config: jaxsense.init(w.key, config),
@@ -345,7 +345,7 @@ FUNCTIONS = {
     ),
     "roadmap config": (
         lambda w: roadmap.build(SMOKE.arena, w.scene.layout),
-        ": must be Config, all settings",
+        ": must be Config, of jaxsense.config.whole",
     ),
     "roadmap batch": (
         lambda w: roadmap.build(SMOKE, jax.tree.map(lambda x: x[None], w.scene.layout)),
@@ -815,7 +815,7 @@ FUNCTIONS = {
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
     "make_mdp without models": (
         lambda w: jaxsense.make_mdp(SMOKE, None),
-        "models = NoneType: must be Models",
+        "models = None: must be Models",
     ),
     "make_mdp of others": (
         lambda w: jaxsense.make_mdp(OTHERS, w.models),
