@@ -11,7 +11,7 @@ import jaxsense
 from benchmarks import measure
 from jaxsense import Config, Models
 from jaxsense.config import ConfigError, parse_json
-from jaxsense.run import cli
+from jaxsense.run import cli, rundir
 from jaxsense.tasks import registry
 from jaxsense.tasks.pretrained import PREFIX
 
@@ -81,7 +81,7 @@ def _made(run: Path) -> dict[str, object]:
     """What made the models of a run."""
     if (name := str(run)).startswith(PREFIX):
         return dataclasses.asdict(registry.origin(name.removeprefix(PREFIX)))
-    found: Any = parse_json((cli.find_run(run) / "config.json").read_text(encoding="utf-8"))
+    found: Any = parse_json((rundir.newest(run) / "config.json").read_text(encoding="utf-8"))
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 
 

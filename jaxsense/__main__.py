@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-from typing import NoReturn
 
 from jaxsense.run import output
 from jaxsense.run.version import __version__
@@ -30,16 +29,12 @@ def run() -> None:
         case ["--version", *_]:
             output.tell(f"jaxsense {__version__}")
         case [name, *_] if name in COMMANDS:
-            _run(name)
+            del sys.argv[1]  # the command reads the rest
+            importlib.import_module(COMMANDS[name][0]).main()
         case [name, *_]:
-            _fail(name)
-
-
-def _run(name: str) -> None:
-    """Runs a command, which reads the rest of the command line."""
-    del sys.argv[1]
-    module, _ = COMMANDS[name]
-    importlib.import_module(module).main()
+            known = ", ".join(COMMANDS)
+            output.complain(f"jaxsense: command = {name[:80]!r}: must be one of {known}")
+            sys.exit(2)
 
 
 def _help() -> str:
@@ -49,13 +44,6 @@ def _help() -> str:
     begin = "usage: jaxsense COMMAND [OPTIONS]\n\ncommands:"
     end = "\n`jaxsense COMMAND --help` lists its options, `jaxsense --version` the version."
     return "\n".join([begin, *lines, end])
-
-
-def _fail(name: str) -> NoReturn:
-    """Ends the process with one line about a command that does not exist."""
-    known = ", ".join(COMMANDS)
-    output.complain(f"jaxsense: command = {name[:80]!r}: must be one of {known}")
-    sys.exit(2)
 
 
 if __name__ == "__main__":

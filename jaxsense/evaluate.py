@@ -14,7 +14,7 @@ import rich.table
 
 from jaxsense import mission, summary
 from jaxsense.config import TIMESTEP, Config, ConfigError
-from jaxsense.config.checks import check_fields, require
+from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
 from jaxsense.run import batches, cli, devices, files, missions, output, rundir
@@ -52,7 +52,7 @@ class Arguments:
     run: Annotated[Path, Name("RUN")]
     """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
     newest one in `runs/`."""
-    episodes: int = 256
+    episodes: int = limited(256, at_least=1, at_most=MAX_EPISODES)
     """Number of missions per policy."""
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
@@ -77,8 +77,6 @@ class Arguments:
 
     def __post_init__(self):
         check_fields(self, bits=64)
-        most = f"must be from 1 to {MAX_EPISODES:,}"
-        require(1 <= self.episodes <= MAX_EPISODES, self, "episodes", most)
         require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
         cli.require_directory("cache", self.cache)
 
@@ -92,7 +90,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
-        arguments = dataclasses.replace(arguments, run=cli.find_run(arguments.run))
+        arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained, models.agent.plays)
@@ -247,10 +245,7 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
 
 
 def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission.Case]:
-    """The cases to play; raises `ConfigError` for an unknown policy or too many episodes."""
-    # Checked like the number of a run's own missions.
-    settings = dataclasses.replace(scenario.config.mission, episodes=arguments.episodes)
-    dataclasses.replace(scenario.config, mission=settings)
+    """The cases to play; raises `ConfigError` for an unknown policy."""
     cases = mission.cases(scenario.config, scenario.policies)
     if arguments.policy == "all":
         return cases

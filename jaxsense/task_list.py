@@ -41,9 +41,9 @@ def main(argv: list[str] | None = None) -> None:
         tell(f"{name}: {tasks.about(name)}.")
     tell(
         f"Returns are interquartile means over {tasks.SEEDS} seeds of {tasks.EPISODES:,} episodes, "
-        f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies."
+        f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies.\n"
+        'Next, in Python: jaxsense.score("noisy-v0", policy)'
     )
-    tell('Next, in Python: jaxsense.score("noisy-v0", policy)')
 
 
 def _table(found: list[Task]) -> Table:

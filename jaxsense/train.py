@@ -17,7 +17,7 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import summary
+from jaxsense import mission, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
@@ -34,7 +34,8 @@ from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare, statistics
-from jaxsense.summary.blocks import Header
+from jaxsense.summary.blocks import Header, Made
+from jaxsense.summary.read import read_made
 
 PROGRAM = "jaxsense.train"
 _MOST_TOGETHER = 16  # seeds in one program on an accelerator
@@ -176,7 +177,7 @@ def parse(
             num_seeds=stored.num_seeds,
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
-        pipeline.check(arguments.config, policies)
+        mission.require_playable(arguments.config, policies)
         if arguments.tensorboard:
             tensorboard.require()
         seeds.check_range(arguments.seed, arguments.num_seeds)
@@ -332,7 +333,7 @@ def _train_together(
                 _warn(f"{result}; earlier checkpoints are in {run.path}")
                 continue
             monitor.check_stop()
-            header = _header(run, run.made("mission"))
+            header = _header(run, run.sign("mission"))
             found: summary.Summary = {**header, "timing": timing, **result}
             _report().write(run, drawn[run.path], found)
             monitor.check_stop()
@@ -344,9 +345,10 @@ def _train_together(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
-    summaries = [summary.read(path) for path in paths]
-    timing, of_each, means = statistics.of_seeds(summaries)
-    header = _header(run, [*statistics.made(summaries), *run.made("means")])
+    timing, of_each, means = statistics.of_seeds([summary.read(path) for path in paths])
+    made = [(path.name, each) for path in paths for each in read_made(path)]
+    seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
+    header = _header(run, [*seeds_made, *run.made("means")])
     found: summary.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
@@ -367,7 +369,7 @@ def _warn(text: str) -> None:
     cli.warn(PROGRAM, text)
 
 
-def _header(run: RunDirectory, made: list[summary.Made]) -> Header:
+def _header(run: RunDirectory, made: list[Made]) -> Header:
     """A summary's keys about the run itself, with what made its stages if that differs."""
     found: Header = {
         "preset": run.settings.preset,

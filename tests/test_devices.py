@@ -150,27 +150,25 @@ def test_the_pool_of_a_backend_has_more_members_than_programs(monkeypatch, pool,
     assert "NPROC" not in os.environ
 
 
-def test_the_pool_is_made_large_enough_before_there_is_a_backend(monkeypatch):
-    monkeypatch.setattr(devices, "_has_backend", lambda: False)
-    # On a system that cannot tell which cores a process may use.
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    monkeypatch.delenv("NPROC")
-    assert devices.start(64) == Workers(threads=64)
-    assert os.environ["NPROC"] == str(max(128, os.cpu_count()))
-
-
-def test_a_backend_is_noticed_and_nothing_changes():
+def test_the_pool_is_made_large_enough_before_there_is_a_backend():
     number = jax.config.jax_num_cpu_devices
-    assert devices._has_backend()
-    assert jax.config.jax_num_cpu_devices == number
     script = """
-import jax
+import os, jax
 from jaxsense.run import devices
+if hasattr(os, "sched_getaffinity"):
+    del os.sched_getaffinity  # as on a system that cannot tell which cores a process may use
 number = jax.config.jax_num_cpu_devices
-assert not devices._has_backend()
+assert devices.start(64) == devices.Workers(threads=64)
+assert os.environ["NPROC"] == str(max(128, os.cpu_count()))
 assert jax.config.jax_num_cpu_devices == number
+del os.environ["NPROC"]
+devices.start(64)
+assert "NPROC" not in os.environ  # too late
 """
-    subprocess.run([sys.executable, "-c", script], check=True)
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    subprocess.run([sys.executable, "-c", script], check=True, env=environment)
+    devices.start(1)
+    assert jax.config.jax_num_cpu_devices == number
 
 
 def test_functions_of_the_library_leave_the_process_as_it_was(tmp_path):

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import weakref
-from concurrent.futures import CancelledError
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +14,9 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS
-from jaxsense.run import devices, loop, missions, pipeline, programs
+from jaxsense.run import devices, loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
-from jaxsense.run.kept import Kept
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.together import Trainings
@@ -168,51 +166,6 @@ def test_programs_are_held_where_the_number_of_trainings_is_unknown(monkeypatch)
         loop.train(KEY, SMOKE, compiled, monitor)
         found = loop.train(KEY, SMOKE, compiled, monitor)
     np.testing.assert_array_equal(found.outputs["count"], [6, 6])
-
-
-@pytest.mark.parametrize("is_kept", [True, False])
-def test_kept_missions_are_loaded_when_no_stage_needs_the_scans(monkeypatch, tmp_path, is_kept):
-    order, kept = [], Kept(tmp_path)
-    monkeypatch.setattr(missions, "are_kept", lambda *_: is_kept)
-
-    def last(key, config, x):
-        order.append("last traced")
-        return x
-
-    kinds = [
-        counting("first"),
-        counting("scans", is_passing=True),
-        Stage("long", lambda key, config, x: x, {"x": "scans"}),
-        Stage("short", lambda key, config, x: x, {"x": "scans"}),
-        Stage("last", last, {"x": "short"}),
-    ]
-    used = programs.Programs.used
-
-    def watched(self, stage):
-        order.append(f"{stage.name} done")
-        used(self, stage)
-
-    monkeypatch.setattr(programs, "_trace_missions", lambda *_: order.append("missions"))
-    monkeypatch.setattr(programs.Programs, "used", watched)
-    monkeypatch.setattr(programs, "stages", lambda config: kinds)
-    monitor = Monitor()
-    with pipeline.compiled(SMOKE, monitor, kept=kept) as compiled:
-        loop.train(KEY, SMOKE, compiled, monitor)
-        while "missions" not in order:
-            time.sleep(0.01)
-    if is_kept:
-        assert order.index("missions") > max(map(order.index, ("long done", "short done")))
-    else:
-        assert order.index("missions") < order.index("last traced")
-
-
-def test_a_run_that_ends_before_its_kept_missions_are_loaded_does_not_hang(monkeypatch, tmp_path):
-    monkeypatch.setattr(missions, "are_kept", lambda *_: True)
-    monkeypatch.setattr(programs, "stages", lambda config: [counting("count")])
-    with pipeline.compiled(SMOKE, Monitor(), kept=Kept(tmp_path)) as compiled:
-        compiled.of_stages["count"].finish.wait()
-    with pytest.raises(CancelledError):
-        compiled.player.result(timeout=60)
 
 
 def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(

@@ -5,14 +5,14 @@ import shutil
 
 import pytest
 from smoke import without_times
-from summaries import ORIGIN, SUMMARY
+from summaries import ORIGIN
 
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import rundir, version
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.summary import compare, statistics
+from jaxsense.summary import compare
 
 THIS = {
     "versions": {"jaxsense": "0.4.0", "python": "3.11.7", "jax": "0.10.2"},
@@ -87,16 +87,6 @@ def test_stages_of_runs_that_were_not_signed_are_of_unknown_origin(tmp_path, mon
     with RunDirectory.resume(tmp_path / "run") as run:
         told = compare.several_origins(run.made("mission"))
     assert "python unknown and 3.11.7" in told
-
-
-def test_means_of_seeds_name_what_made_each():
-    parts = [{**THIS, "stage": "jmvae_1"}, {**OTHERS["JAX"][0], "stage": "mission"}]
-    found = statistics.made([{**SUMMARY, **THIS, "seed": 4}, {**SUMMARY, "origins": parts}])
-    assert found == [
-        {**THIS, "date": SUMMARY["date"], "stage": "seed 4: all stages"},
-        {**parts[0], "stage": "seed 90210: jmvae_1"},
-        {**parts[1], "stage": "seed 90210: mission"},
-    ]
 
 
 @pytest.mark.parametrize(

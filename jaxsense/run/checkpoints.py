@@ -57,7 +57,7 @@ class Checkpoints:
         self,
         path: Path | None = None,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
-        saved: Callable[[str], None] = lambda name: None,
+        saved: Callable[[str], object] = lambda name: None,
     ):
         """Opens a directory, which need not exist.
 

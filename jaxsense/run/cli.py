@@ -9,10 +9,9 @@ from typing import NoReturn, TypeVar
 import jax
 
 from jaxsense.config import Config, ConfigError, options, require_32_bits
-from jaxsense.run import kept, rundir
+from jaxsense.run import kept
 from jaxsense.run.kept import Kept
 from jaxsense.run.output import complain, tell
-from jaxsense.tasks import pretrained
 
 T = TypeVar("T")
 
@@ -45,8 +44,7 @@ def parse(
     """
     base = arguments if default is None else default
     if {"-h", "--help", "--help-all"} & set(argv):
-        is_all = "--help-all" in argv
-        tell(options.describe(program, base, () if is_all else common).rstrip("\n"))
+        tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip("\n"))
         sys.exit(0)
     try:
         require_32_bits()
@@ -100,20 +98,6 @@ def require_directory(field: str, path: Path | None) -> None:
         raise ConfigError(field, str(path), f"cannot be used ({error.strerror})") from None
     if is_other:
         raise ConfigError(field, str(path), "must be a directory")
-
-
-def find_run(path: Path) -> Path:
-    """Returns the directory of a run, where `latest` is the newest finished one in `runs/`.
-
-    Raises:
-      ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
-    """
-    preset = (given := str(path)).removeprefix(pretrained.PREFIX)
-    if (preset != given or preset in pretrained.PRETRAINED) and not path.exists():
-        demo = f"{options.command('jaxsense.demo')} --preset {preset}"
-        reason = f"must be the directory of a finished run; play pretrained models with {demo}"
-        raise ConfigError("run", given, reason)
-    return rundir.newest(path)
 
 
 def keep_programs(

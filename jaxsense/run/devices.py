@@ -146,7 +146,10 @@ def start(number: int | None) -> Workers:
     jax.config.update("jax_default_matmul_precision", "highest")
     check(number)
     wanted = number or NUM_THREADS
-    if not _has_backend():
+    cpus = jax.config.values["jax_num_cpu_devices"]
+    with contextlib.suppress(RuntimeError):  # JAX raises it once XLA has its threads
+        jax.config.update("jax_num_cpu_devices", cpus + 2)
+        jax.config.update("jax_num_cpu_devices", cpus)
         os.environ.setdefault("NPROC", str(max(2 * wanted, cores())))
     try:
         is_cpu = jax.default_backend() == "cpu"
@@ -177,17 +180,6 @@ def threads(wanted: int = NUM_THREADS) -> int:
     """
     given = os.environ.get("NPROC", "")
     return min(wanted, max(1, (int(given) if given.isdecimal() else cores()) - 1))
-
-
-def _has_backend() -> bool:
-    """Whether JAX has created its backend: then it refuses another number of CPU devices."""
-    number = jax.config.values["jax_num_cpu_devices"]
-    try:
-        jax.config.update("jax_num_cpu_devices", number + 2)
-    except RuntimeError:
-        return True
-    jax.config.update("jax_num_cpu_devices", number)
-    return False
 
 
 def memory() -> int | None:

@@ -1,6 +1,7 @@
 """Keeps traced programs, and JAX's compilation cache, in a directory for later runs."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import pickle
@@ -22,7 +23,6 @@ Function: TypeAlias = Callable[..., PyTree]
 
 _MAX_KEPT = 512  # traced programs; a run has about twenty
 _MAX_BYTES = 2**31  # of compiled programs
-_CPU_INFO = Path("/proc/cpuinfo")
 _FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
 
 
@@ -70,7 +70,7 @@ class Kept:
           OSError: if the directory cannot be made, or if other users may write to it: loading a
             program runs it.
         """
-        self.path, self._told = directory / "traced", set[str]()
+        self.path, self._complain = directory / "traced", functools.cache(complain)
         _make_private(self.path)
         self._depends = repr((settings, _surroundings())).encode()
         # Another run may be removing some too.
@@ -87,10 +87,6 @@ class Kept:
         for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
             path.unlink(missing_ok=True)
         files.remove_unfinished(self.path)
-
-    def holds(self, name: str, args: PyTree) -> bool:
-        """Whether the directory holds a program's file, see `find`."""
-        return self._file(name, args).exists()
 
     def find(self, name: str, args: PyTree) -> Traced | None:
         """Finds a cached program.
@@ -146,10 +142,8 @@ class Kept:
 
     def _tell(self, error: Exception) -> None:
         """Tells once why programs are slower to start than they could be."""
-        reason = " ".join(f"{type(error).__name__} {error}".splitlines()[:1])
-        if reason not in self._told:
-            self._told.add(reason)
-            complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
+        reason = f"{type(error).__name__} {error}".splitlines()[0]
+        self._complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
 
     def _file(self, name: str, args: PyTree) -> Path:
         """The file of a program."""
@@ -222,11 +216,7 @@ def _is_private(found: os.stat_result, others: int) -> bool:
 
 
 def _surroundings() -> list[object]:
-    """Versions, options, devices and processor, on which tracing and compiling depend."""
-    features = set()
-    with contextlib.suppress(OSError):
-        lines = _CPU_INFO.read_text(encoding="utf-8").splitlines()
-        features = {line for line in lines if line.startswith(("flags", "model name", "Features"))}
+    """Code, versions, options and devices, on which tracing depends."""
     variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
     return [
         version.SOURCE,
@@ -235,7 +225,6 @@ def _surroundings() -> list[object]:
         sorted((name, str(x)) for name, x in jax.config.values.items() if not _sets_cache(name)),
         jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
-        sorted(features),
     ]
 
 

@@ -1,7 +1,6 @@
 """Drives a training from the host: stage after stage, chunk after chunk."""
 
 import dataclasses
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -66,33 +65,6 @@ def train(
             raise
 
 
-class _Held:
-    """The output of a stage, until all stages that need it are done."""
-
-    def __init__(self, users: int, is_passing: bool):
-        self.output: Output = None
-        self._users, self._is_passing = users, is_passing
-        self._lock = threading.Lock()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nobody needs the output any longer."""
-        return self._is_passing and self._users == 0
-
-    def put(self, output: Output) -> None:
-        """Holds the output, if anybody needs it."""
-        with self._lock:
-            if not self.is_over:
-                self.output = output
-
-    def used(self) -> None:
-        """Notes that one of the stages that need the output is done."""
-        with self._lock:
-            self._users -= 1
-            if self.is_over:
-                self.output = None
-
-
 class _Loop:
     """One training."""
 
@@ -110,11 +82,7 @@ class _Loop:
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
-        stages = programs.stages
-        self._held = {
-            stage.name: _Held(sum(stage.name in each.sources for each in stages), stage.is_passing)
-            for stage in stages
-        }
+        self._outputs, self._done = dict[str, Output](), set[str]()
 
     def run(self) -> Trained:
         """Runs all stages."""
@@ -128,10 +96,9 @@ class _Loop:
                 pass
         for future in done.values():
             future.result()
-        outputs = {name: held.output for name, held in self._held.items() if not held.is_over}
         self._monitor.check_stop()
         self.wait_for_saving()
-        return Trained(outputs, self._curves)
+        return Trained(self._outputs, self._curves)
 
     def wait_for_saving(self) -> None:
         """Waits until all is saved, and raises the first error."""
@@ -139,12 +106,16 @@ class _Loop:
             each.result()
 
     def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
-        """Finds the output of a stage, and lets go of those that no other stage needs."""
+        """Finds the output of a stage, and lets go of outputs that no other stage needs."""
         try:
-            self._held[stage.name].put(self._output(stage, before))
+            self._outputs[stage.name] = self._output(stage, before)
         finally:
-            for name in before:
-                self._held[name].used()
+            self._done.add(stage.name)
+            left = [each for each in self._programs.stages if each.name not in self._done]
+            needed = {name for each in left for name in each.sources}
+            for each in self._programs.stages:
+                if each.is_passing and each.name not in needed:
+                    self._outputs.pop(each.name, None)
             self._programs.used(stage)
             devices.give_back_freed()
 
@@ -156,7 +127,7 @@ class _Loop:
                 return found
             for future in before.values():
                 future.result()
-            inputs = stage.select({name: self._held[name].output for name in before})
+            inputs = stage.select({name: self._outputs[name] for name in before})
             self._monitor.check_stop()
             output = (self._train if stage.chunks else self._begin)(stage, inputs)
             if not stage.is_optional:

@@ -100,37 +100,6 @@ class _Found:
     metrics: PyTree[Array]
 
 
-def are_kept(config: Config, compiler: Compiler, batch: int, workers: Workers = ALONE) -> bool:
-    """Whether the programs of a `Player` are cached, so that they need not be compiled.
-
-    Args:
-      config: all settings.
-      compiler: of the player.
-      batch: see `Player`.
-      workers: see `Player`.
-    """
-    if compiler.kept is None:
-        return False
-    begun = _begun(config, -(-batch // workers.number), None)
-    return compiler.kept.holds(f"{_STAGE}-{_BEGIN}", begun)
-
-
-def _begun(config: Config, number: int, models: Models | None) -> tuple[PyTree, ...]:
-    """Arguments with which the first program of a `Player` is traced.
-
-    Args:
-      config: all settings.
-      number: of missions side by side, in a call or in a share of it.
-      models: see `Player`.
-    """
-    numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
-    faults = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
-    )
-    shapes = jax.eval_shape(lambda: models or init(jax.random.key(0), config))
-    return jax.random.key(0), config, shapes, numbers, numbers, faults
-
-
 class Player:
     """Plays missions in batches, with programs that are compiled before any model is trained.
 
@@ -206,8 +175,14 @@ class Player:
             first = jax.tree.map(lambda x: x[:recorded], states)
             return slots, _found(scenario, models, slots), Recording(first, records)
 
-        begun = _begun(config, self._share * together.number, models)
-        key, _, shapes, numbers, _, _ = begun
+        number = self._share * together.number
+        numbers = jax.ShapeDtypeStruct((number,), jnp.int32)
+        faults = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((number, *x.shape), x.dtype), no_faults(config)
+        )
+        key = jax.random.key(0)
+        shapes = jax.eval_shape(lambda: models or init(key, config))
+        begun = key, config, shapes, numbers, numbers, faults
         whole = (0, 1, 2)
         self._begin = Program(compiler, _STAGE, _BEGIN)
         slots = self._begin.compile(

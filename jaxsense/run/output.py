@@ -9,8 +9,7 @@ import os
 import sys
 from collections.abc import Callable
 
-INTERRUPTED = 130
-"""Exit status, as in shells."""
+INTERRUPTED = 130  # exit status, as in shells
 _RARELY = 100_000, 50, 50  # see `gc.set_threshold`
 
 

@@ -68,11 +68,6 @@ class Played:
     missions: summary.Missions
 
 
-def check(config: Config, policies: OwnPolicies | None = None) -> None:
-    """Checks what can only be checked by building the parts of a run."""
-    mission.require_playable(config, policies)
-
-
 @contextlib.contextmanager
 def compiled(
     config: Config,
@@ -96,7 +91,7 @@ def compiled(
     Raises:
       ConfigError: see `mission.require_playable`.
     """
-    check(config, policies)
+    mission.require_playable(config, policies)
     with Compiler(monitor, kept) as compiler:
         yield compile_programs(config, compiler, workers, trainings, policies)
 

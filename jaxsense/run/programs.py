@@ -29,7 +29,6 @@ from jaxsense.training.stages import stages
 OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
 _BEFORE_MISSIONS = 2  # stages that all others wait for
-_PATIENCE = 0.2  # s; between two checks whether the run is over
 _ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
 
 
@@ -81,9 +80,6 @@ class Programs:
       trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
       left: how often each stage's programs are still needed, if it is known.
-      with_scans: names of the stages that read a passing output, as the scans are, see
-        `Stage.is_passing`, and that no training is done with yet.
-      without_scans: set once there are none.
     """
 
     config: Config
@@ -94,8 +90,6 @@ class Programs:
     trainings: Trainings
     policies: OwnPolicies | None = None
     left: Counter[str] = dataclasses.field(default_factory=Counter)
-    with_scans: set[str] = dataclasses.field(default_factory=set)
-    without_scans: threading.Event = dataclasses.field(default_factory=threading.Event)
     _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
 
     def of(self, stage: Stage) -> StagePrograms:
@@ -105,9 +99,6 @@ class Programs:
     def used(self, stage: Stage) -> None:
         """Notes that a training is done with a stage, and lets go of programs that none needs."""
         with self._lock:
-            self.with_scans.discard(stage.name)
-            if not self.with_scans:
-                self.without_scans.set()
             self.left[stage.program] -= 1
             if self.left[stage.program] == 0:
                 self.of(stage).release()
@@ -145,7 +136,6 @@ def compile_programs(
         is_shared = trainings.number > 1 and not stage.has_rows
         return SharedProgram(alone, trainings, workers) if is_shared else alone
 
-    passing = {stage.name for stage in found if stage.is_passing}
     programs = Programs(
         config=config,
         stages=found,
@@ -163,7 +153,6 @@ def compile_programs(
         trainings=trainings,
         policies=policies,
         left=Counter(stage.program for stage in found for _ in range(trainings.total or 0)),
-        with_scans={stage.name for stage in found if passing.intersection(stage.sources)},
     )
 
     thread = ThreadPoolExecutor(1, "trace")
@@ -180,23 +169,14 @@ def _on_cpu() -> bool:
 def _trace(programs: Programs, compiler: Compiler) -> None:
     """Traces all programs; an error reaches whoever waits for one."""
     try:
-        for stage in programs.stages[:_BEFORE_MISSIONS]:
-            _trace_stage(programs, stage)
         # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
         # free to compile, and everything waits for tracing.
-        batch, workers = _batch(programs), programs.workers
-        is_kept = _on_cpu() and missions.are_kept(programs.config, compiler, batch, workers)
-        is_first = _on_cpu() and not is_kept
-        if is_first:
-            _trace_missions(programs, compiler)
-        for stage in programs.stages[_BEFORE_MISSIONS:]:
+        before = _BEFORE_MISSIONS if _on_cpu() else len(programs.stages)
+        for stage in programs.stages[:before]:
             _trace_stage(programs, stage)
-        if is_kept:
-            # They load in seconds, but take as much memory as the scans.
-            while not programs.without_scans.wait(_PATIENCE):
-                compiler.check_open()
-        if not is_first:
-            _trace_missions(programs, compiler)
+        _trace_missions(programs, compiler)
+        for stage in programs.stages[before:]:
+            _trace_stage(programs, stage)
     except BaseException as error:
         programs.fail(error)
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -13,18 +12,19 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, require_32_bits
+from jaxsense.config.options import command
 from jaxsense.models import Models
 from jaxsense.run import devices, files, version
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.settings import Settings, as_json, of_run, resumable
-from jaxsense.summary import Made, Origin
+from jaxsense.summary.blocks import Made, Origin
 from jaxsense.summary.compare import UNKNOWN
-from jaxsense.summary.read import read_made
+from jaxsense.summary.read import ORIGINS, read_made
 from jaxsense.tasks.pretrained import PREFIX, PRETRAINED, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
 
-_METRICS, _ORIGINS = "metrics.jsonl", "origins.json"
+_METRICS = "metrics.jsonl"
 
 
 class RunDirectory:
@@ -38,7 +38,7 @@ class RunDirectory:
 
     def __init__(self, path: Path, settings: Settings):
         self.path, self.settings = path, settings
-        self.checkpoints = Checkpoints(path / "checkpoints", saved=self._sign)
+        self.checkpoints = Checkpoints(path / "checkpoints", saved=self.sign)
         self._made: list[Made] = []
         self._reported: dict[str, int] = {}
 
@@ -94,9 +94,8 @@ class RunDirectory:
             run = cls(path, settings)
             run._remove_partial()
             run.checkpoints.check(is_begun=(path / _METRICS).exists())
-            if (path / _ORIGINS).exists():
-                run._made = read_made(path / _ORIGINS)
-            elif run.checkpoints.exists():
+            run._made = read_made(path)
+            if not run._made and run.checkpoints.exists():
                 run._made = [{**UNKNOWN, "stage": "earlier stages"}]
             run._read_metrics()
             yield run
@@ -121,12 +120,13 @@ class RunDirectory:
         mine: Made = {**_process(), "stage": stage}
         return self._made if mine in self._made else [*self._made, mine]
 
-    def _sign(self, checkpoint: str) -> None:
-        """Writes to `origins.json` that this process made a checkpoint."""
+    def sign(self, checkpoint: str) -> list[Made]:
+        """Writes to `origins.json` that this process made a checkpoint; returns its content."""
         made = self.made(checkpoint.removeprefix("unfinished/").removeprefix("curves_"))
         if made != self._made:
             self._made = made
-            write_json(self.path / _ORIGINS, made)
+            write_json(self.path / ORIGINS, made)
+        return made
 
     def _remove_partial(self) -> None:
         """Removes partial files of a killed process."""
@@ -170,18 +170,17 @@ def unused(path: Path) -> Path:
     Raises:
       ConfigError: if it cannot be made.
     """
-    first = path
+    found, number = path, 1
     try:
-        first.parent.mkdir(parents=True, exist_ok=True)
-        for number in itertools.count(2):
-            try:
-                path.mkdir()
-                break
-            except FileExistsError:
-                path = first.with_name(f"{first.name}-{number}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            with contextlib.suppress(FileExistsError):
+                found.mkdir()
+                return found
+            number += 1
+            found = path.with_name(f"{path.name}-{number}")
     except OSError as error:
         raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
-    return path
 
 
 def dated(name: str) -> Path:
@@ -276,10 +275,16 @@ def newest(path: Path) -> Path:
     """Returns a path; for `latest`, that of the newest finished run in `runs/`.
 
     Raises:
-      ConfigError: if there is no finished run.
+      ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
     """
-    if path != Path("latest") or path.exists():
+    preset = (given := str(path)).removeprefix(PREFIX)
+    is_pretrained = preset != given or preset in PRETRAINED
+    if not (is_pretrained or given == "latest") or path.exists():
         return path
+    if is_pretrained:
+        reason = f"must be the directory of a finished run; {PREFIX}{preset} only names models, "
+        demo = f"{command('jaxsense.demo')} --preset {preset}"
+        raise ConfigError("run", given, f"{reason}which {demo} plays")
     configs = Path("runs").glob("*/config.json")
     begun = {each.stat().st_mtime_ns: each.parent for each in configs}
     finished = {time: run for time, run in begun.items() if (run / "summary.json").exists()}
@@ -309,10 +314,6 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     path, given = Path(path), str(path)
     if given.startswith(PREFIX) and not path.exists():
         return load_pretrained(given.removeprefix(PREFIX))
-    if given in PRETRAINED and not path.exists():
-        raise ConfigError(
-            "run", given, f"must be the directory of a finished run, or {PREFIX}{given}"
-        )
     path = newest(path)
     settings = of_run(path, trust)
     config = settings.config

@@ -89,24 +89,20 @@ def rewards(
     Returns:
       `[K, epochs]` rewards as in `pipeline.Learned.rewards`, without those of such checkpoints.
     """
-    shapes = {
-        "reward": np.zeros(config.dqn.epochs, np.float32),
-        "evaluation": np.zeros(config.dqn.epochs, np.float32),
-        "epsilon": np.zeros(config.dqn.epochs, np.float32),
-        "seconds": np.zeros(config.dqn.epochs // config.dqn.chunk, np.float32),
-    }
+    of_epochs = np.zeros(config.dqn.epochs, np.float32)
+    shapes = dict.fromkeys(("reward", "evaluation", "epsilon"), of_epochs)
+    shapes = {**shapes, "seconds": of_epochs[:: config.dqn.chunk]}
 
     def load(run: Path, network: str) -> list[dict[str, np.ndarray]]:
         directory, name = run / "checkpoints", f"curves_{network}"
+        reason = f"{directory}: holds no {name}"
         try:
             found = Checkpoints(directory).load(name, shapes)
         except ConfigError as error:
-            warn(f"{error}; left out of reward.svg")
-            return []
+            found, reason = None, str(error)
         if found is None:
-            warn(f"{directory}: holds no {name}; left out of reward.svg")
-            return []
-        return [found]
+            warn(f"{reason}; left out of reward.svg")
+        return [] if found is None else [found]
 
     def load_all(network: str) -> dict[str, np.ndarray]:
         found = [curves for run in runs for curves in load(run, network)]

@@ -5,7 +5,6 @@ from jaxsense.summary.blocks import Agent as Agent
 from jaxsense.summary.blocks import Case as Case
 from jaxsense.summary.blocks import Evaluation as Evaluation
 from jaxsense.summary.blocks import Learned as Learned
-from jaxsense.summary.blocks import Made as Made
 from jaxsense.summary.blocks import Missions as Missions
 from jaxsense.summary.blocks import Origin as Origin
 from jaxsense.summary.blocks import Results as Results

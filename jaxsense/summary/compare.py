@@ -194,9 +194,8 @@ def remarks(found: Summary) -> list[str]:
     Returns:
       Sentences. Where results are not meant to be good, none says how to improve them.
     """
-    made = several_origins(found.get("origins", ()))
     caution = _CAUTIONS.get(found["preset"]) or unsound(found["belief"])
-    return [each for each in (made, caution) if each]
+    return [each for each in (several_origins(found.get("origins", ())), caution) if each]
 
 
 def detection_sizes(block: Missions) -> str:

@@ -11,6 +11,7 @@ from jaxsense.config import ConfigError, parse_json
 from jaxsense.config.options import command
 from jaxsense.summary.blocks import Evaluation, Made, Results, Summary
 
+ORIGINS = "origins.json"
 EVALUATIONS = "evaluations"
 """The directory of evaluations in that of a run."""
 RESULTS = tuple(get_type_hints(Results))
@@ -44,16 +45,20 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
     return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
 
 
-def read_made(file: Path) -> list[Made]:
-    """Reads what made each stage of a run.
+def read_made(run: Path) -> list[Made]:
+    """Reads what made each stage of a run, which need not be finished.
 
     Args:
-      file: its `origins.json`.
+      run: its directory.
+
+    Returns:
+      The content of its `origins.json`; of none, nothing.
 
     Raises:
-      ConfigError: if it cannot be read, or a value in it is missing or wrong.
+      ConfigError: if the file cannot be read, or a value in it is missing or wrong.
     """
-    return cast(list[Made], _read(file.parent, file, list[Made]))
+    file = run / ORIGINS
+    return cast(list[Made], _read(run, file, list[Made])) if file.exists() else []
 
 
 class NotFinishedError(ConfigError):

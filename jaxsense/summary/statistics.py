@@ -1,11 +1,11 @@
 """Means and intervals over several seeds."""
 
 from collections.abc import Sequence
-from typing import cast, get_type_hints
+from typing import cast
 
 import numpy as np
 
-from jaxsense.summary.blocks import Made, Origin, Results, Summary, Timing
+from jaxsense.summary.blocks import Results, Summary, Timing
 from jaxsense.summary.compare import interval
 from jaxsense.summary.read import RESULTS
 
@@ -28,21 +28,6 @@ def of_seeds(runs: Sequence[Summary]) -> tuple[Timing, dict[str, Results], Resul
     results = [cast(Results, {name: run[name] for name in RESULTS}) for run in runs]
     of_each = {str(run["seed"]): result for run, result in zip(runs, results, strict=True)}
     return total, of_each, statistics(results)
-
-
-def made(runs: Sequence[Summary]) -> list[Made]:
-    """What made the stages of several seeds.
-
-    Args:
-      runs: their summaries.
-    """
-    wholes = [{name: run[name] for name in get_type_hints(Origin) if name in run} for run in runs]
-    parts = [
-        (run["seed"], part)
-        for run, whole in zip(runs, wholes, strict=True)
-        for part in run.get("origins", [{**whole, "stage": "all stages"}])
-    ]
-    return cast(list[Made], [{**x, "stage": f"seed {seed}: {x['stage']}"} for seed, x in parts])
 
 
 def statistics(results: Sequence[Results]) -> Results:

@@ -246,14 +246,14 @@ OTHERS = [
     (
         evaluate,
         ["pretrained:noisy"],
-        "run = 'pretrained:noisy': must be the directory of a finished run; play pretrained models "
-        "with python -m jaxsense.demo --preset noisy",
+        "run = 'pretrained:noisy': must be the directory of a finished run; pretrained:noisy only "
+        "names models, which python -m jaxsense.demo --preset noisy plays",
     ),
     (
         evaluate,
         ["noisy"],
-        "run = 'noisy': must be the directory of a finished run; play pretrained models with "
-        "python -m jaxsense.demo --preset noisy",
+        "run = 'noisy': must be the directory of a finished run; pretrained:noisy only names "
+        "models, which python -m jaxsense.demo --preset noisy plays",
     ),
     (evaluate, [""], "run = '': must be a path"),
     (evaluate, ["none"], "none is not a run directory: it has no config.json"),
@@ -291,7 +291,7 @@ OTHERS = [
     (
         export,
         ["noisy"],
-        "run = 'noisy': must be the directory of a finished run, or pretrained:noisy",
+        "run = 'noisy': must be the directory of a finished run; pretrained:noisy only names",
     ),
     (export, ["none"], "none is not a run directory: it has no config.json"),
     (export, ["a\nb"], "run = 'a\\nb': must be a path of printable characters"),

@@ -154,7 +154,7 @@ FUNCTIONS = {
     "load nul": (lambda w: jaxsense.load("\0"), "run = "),
     "load preset": (
         lambda w: jaxsense.load("noisy"),
-        "run = 'noisy': must be the directory of a finished run, or pretrained:noisy",
+        "run = 'noisy': must be the directory of a finished run; pretrained:noisy only names",
     ),
     "load pretrained": (
         lambda w: jaxsense.load("pretrained:loud"),
@@ -237,7 +237,7 @@ FUNCTIONS = {
     ),
     "missions models": (
         lambda w: of_missions(w, models=SMOKE),
-        "models = Config: must be Models, as from load_pretrained",
+        "models = Config: must be Models",
     ),
     "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be a list of one"),
     "missions unhashable": (lambda w: of_missions(w, against=[[]]), "against = [[]]: must be a l"),
