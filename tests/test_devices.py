@@ -176,6 +176,7 @@ def test_functions_of_the_library_leave_the_process_as_it_was(tmp_path):
 import gc, os, sys, warnings
 from pathlib import Path
 import jax
+import scipy.stats  # whose import filters warnings
 import jaxsense
 from jaxsense.run import devices, kept
 

@@ -27,7 +27,7 @@ def test_run_directory_holds_everything(smoke_run):
     names = {path.name for path in smoke_run.iterdir()} | {".lock"}  # which may be gone
     names_of_plots = "latent_space", "reward", "scanlines", "calibration", "policies"
     plots = {f"{name}.svg" for name in names_of_plots}
-    others = {"config.json", "metrics.jsonl", "summary.json", "checkpoints"}
+    others = {"config.json", "metrics.jsonl", "origins.json", "summary.json", "checkpoints"}
     films = {"mission.svg", "mission-naive.svg"}
     assert names == {*others, *plots, *films, "report.html", ".lock"}
     for picture in plots | films:
@@ -40,7 +40,7 @@ def test_summary_keeps_its_contract(smoke_run):
     summary = json.loads((smoke_run / "summary.json").read_text())
     assert set(summary) - {"commit"} == {  # known in a checkout
         "preset", "seed", "versions", "devices", "cores", "date", "timing", "detectors", "jmvae",
-        "belief", "dqn", "mission",
+        "belief", "dqn", "mission", "source",
     }  # fmt: skip
     assert summary["preset"] == "smoke"
     assert summary["seed"] == 5

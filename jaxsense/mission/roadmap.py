@@ -74,6 +74,7 @@ class Roadmap:
         return jnp.min(self.between + self.last(poi, view)[None], axis=1)
 
 
+@checks.typed
 def build(config: Config, layout: Layout) -> Roadmap:
     """Computes the viewpoints of a layout and the paths to them.
 
@@ -84,7 +85,6 @@ def build(config: Config, layout: Layout) -> Roadmap:
     Raises:
       ValueError: if the layout is not that of one arena of `config`.
     """
-    checks.require_type("config", config, Config, "all settings")
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
     arena, settings = config.arena, config.navigation
     radius = _radius(config)

@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -117,7 +118,7 @@ def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray
 
 def _require_valid(scans: np.ndarray, sensor: Sensor) -> None:
     """Raises `ValueError` if a reading is negative, or a brightness above 1."""
-    is_wrong = ~np.asarray(sensor.is_valid(scans.astype(np.float32))) & ~np.isnan(scans)
+    is_wrong = ~np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32))) & ~np.isnan(scans)
     if is_wrong.any():
         returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
         most = " and at most 1, linear RGB" if sensor.channels == 3 else ""

@@ -83,6 +83,7 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
     ]
 
 
+@checks.typed
 def learn(
     key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
 ) -> Learned:
@@ -102,7 +103,6 @@ def learn(
       ValueError: if `config` is no `Config`, or no stage has this name.
     """
     checks.require_key(key)
-    checks.require_type("config", config, Config, "all settings")
     found = stages(config, arena)
     names = [stage.name for stage in found]
     if until is not None and until not in names:
