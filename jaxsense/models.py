@@ -1,6 +1,7 @@
 """All trained networks of a run, as one pytree."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,9 +103,7 @@ class Models:
           ValueError: if there is no such modality, or readings have another shape.
         """
         checks.require_index("modality", modality, len(self.detectors))
-        channels = () if sensor.channels == 1 else (sensor.channels,)
-        shape = (len(sensor.angles), *channels)
-        checks.require_shape(f"readings of {sensor.name}", readings, shape)
+        checks.require_shape(f"readings of {sensor.name}", readings, sensor.shape)
         bearing = windows.wrapped(jnp.asarray(bearing))
         of_window = windows.around(searching.widened(sensor, search), readings, bearing)
         return self.detect_in_window(modality, sensor, of_window, bearing, distance, search)
@@ -216,9 +215,15 @@ def make_bayes(config: Config) -> Bayes:
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
-def make_domains(config: Config) -> tuple[Domain, ...]:
-    """Makes for each modality the domain in which its detector learns."""
-    return tuple(make_domain(config, sensor) for sensor in sensors.make(config))
+def make_models(config: Config, **trained: Any) -> Models:
+    """Makes models of their trained parts; the others follow from the settings.
+
+    Args:
+      config: all settings.
+      **trained: the fields of `Models` but `domains`, `bayes` and `agent`.
+    """
+    domains = tuple(make_domain(config, sensor) for sensor in sensors.make(config))
+    return Models(domains=domains, bayes=make_bayes(config), agent=make_agent(config), **trained)
 
 
 def make_agent(config: Config) -> Agent:
@@ -284,15 +289,13 @@ def init(key: Key, config: Config) -> Models:
             filter_key, model, classes, make_prior(config), config.filter
         ),
     }
-    return Models(
+    return make_models(
+        config,
         detectors=untrained,
-        domains=make_domains(config),
         jmvae=params,
         fusion=fusions[config.jmvae.fusion](),
-        bayes=make_bayes(config),
         novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
-        agent=agent,
         q_networks=tuple(agent.init(k) for k in dqn_keys),
         tours=agent.init_tours(tours_key),
     )

@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import io
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,9 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import sim
+from jaxsense import export, sim
 from jaxsense.config import ViewpointConfig
+from jaxsense.interfaces import robot
 from jaxsense.sim import recorded, resampling
 
 SCENES = 800
@@ -41,8 +43,10 @@ def scans(trained, m, near, far, angles=None, seed=0):
             scene = sim.random_scene(scene_key, world, args[1])
             _, scene = sim.look(look_key, world, scene, m, jnp.int32(0))  # goes there
             data = sim.place(world.arena, scene.layout, scene.poses)
-            parts = noise_key, sensor, world.arena, data, scene.layout, scene.light, m
-            readings = sim.scan(*parts, directions=directions)
+            layout, light = scene.layout, scene.light
+            readings = sim.scan(
+                noise_key, sensor, world.arena, data, layout, light, m, directions=directions
+            )
             place, pose = scene.layout.position[0], scene.poses[m]
             return readings, sim.bearing(pose, place), jnp.linalg.norm(place - pose[:2])
 
@@ -122,16 +126,35 @@ def test_a_sensor_of_half_the_spacing_is_not_the_one_that_was_learned(trained, m
     )
     sensor = sim.sensors.make(fine)[m]
     looks = scans(trained, m, view.min_distance, view.max_distance, sensor.angles, seed=2)
-    found = answers(trained, m, *looks[:3], sensor)
+    readings, bearings, distances, labels = looks
+    found = answers(trained, m, readings, bearings, distances, sensor)
     report(trained, m, "half the spacing", answered=asserted(found))
     assert not found.is_known.any()
     assert asserted(found) == 0
     # Along the rays that were learned, it is.
     own = trained[3].sensors[m]
-    along = recorded.resample(own, sensor.angles, looks[0])
-    found = answers(trained, m, along, *looks[1:3])
-    report(trained, m, "resampled", flagged=1 - found.is_known.mean(), right=right(found, looks[3]))
+    along = recorded.resample(own, sensor.angles, readings)
+    found = answers(trained, m, along, bearings, distances)
+    report(trained, m, "resampled", flagged=1 - found.is_known.mean(), right=right(found, labels))
     assert found.is_known.mean() >= 0.995
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("m", [0, 1])
+def test_archives_know_the_same_looks(trained, m):
+    _, config, models, _ = trained
+    view, name = config.viewpoint, config.modalities[m]
+    contents, programs = robot.load(io.BytesIO(export.archive(config, models)))
+    expected = [view.min_distance, view.max_distance]
+    np.testing.assert_allclose(contents["learned"][name]["distance"], expected, rtol=1e-6)
+    for distance, is_known in zip((0.2, 0.5, view.max_distance + 0.1), (0, 1, 0), strict=True):
+        looks = scans(trained, m, distance - 0.001, distance + 0.001, seed=4)
+        for readings, bearing, at, _ in list(zip(*looks, strict=True))[:40]:
+            for turns in (-1, 0, 1):
+                given = {"readings": readings, "bearing": bearing + turns * 2 * np.pi}
+                found = programs[f"detect_{name}"](**given, distance=at)
+                assert found["is_known"] == is_known
+                assert is_known or not (found["is_there"] or np.ptp(found["features"]))
 
 
 def uneven():

@@ -80,6 +80,7 @@ def test_your_robot(tmp_path, monkeypatch, capsys):
     assert printed.count("distance 0.8: True") == 1
     assert "bearing 0.0, distance 1.1: False" in printed
     assert "bearing 0.6, distance 0.8: False" in printed
+    assert "bearing 0.0, distance 1.3: False, not known" in printed
     assert "['green cylinder', 'red cylinder']" in printed
     assert [*tmp_path.iterdir()] == [tmp_path / "robot.zip"]
     assert names["said"]["most_likely"].shape == (3,)

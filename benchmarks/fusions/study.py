@@ -19,7 +19,7 @@ from jaxsense import (
     Models,
     learn,
     make_bayes,
-    make_domains,
+    make_models,
     mission,
 )
 from jaxsense.config import PresetName
@@ -170,18 +170,17 @@ def _learned(config: Config, key: Key) -> Outputs:
 def _models(
     config: Config, fusion: Fusion, outputs: Outputs, q_networks: tuple[PyTree, ...]
 ) -> Models:
-    return Models(
+    made = make_models(
+        config,
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
-        domains=make_domains(config),
         jmvae=outputs["best_jmvae"],
         fusion=fusion,
-        bayes=make_bayes(config),
         novelty=outputs["novelty"],
         look_values=outputs["look_values"],
-        agent=_agent(config, fusion),
         q_networks=q_networks,
         tours=(),
     )
+    return dataclasses.replace(made, agent=_agent(config, fusion))
 
 
 def _agent(config: Config, fusion: Fusion) -> ProbabilityAgent:

@@ -91,13 +91,12 @@ def _detect(config: Config, m: int) -> Function:
             "features": found.features,
         }
 
-    channels = () if sensor.channels == 1 else (sensor.channels,)
     kind = "distances in metres" if sensor.measures_distance else "readings"
     order = "in the order of `angles` in `sensors`"
     bright = "" if sensor.channels != 3 else ", linear RGB from 0 to 1"
     inputs = {
         "readings": Input(
-            (len(sensor.angles), *channels),
+            sensor.shape,
             f"{kind} of all rays of a scan, {order}{bright}; resample other scans first",
         ),
         "bearing": Input(
@@ -107,9 +106,8 @@ def _detect(config: Config, m: int) -> Function:
         "distance": Input((), "expected from the sensor to the PoI's centre, in metres"),
     }
     outputs = {
-        "is_known": "whether the detector has learned from looks like this one, see `learned`, and "
-        "the scan was recorded around the bearing; if not, it says neither that the PoI is there "
-        "nor that it is not",
+        "is_known": "whether the detector has learned from such looks, see `learned`, and the scan "
+        "was recorded around the bearing; if not, what is there stays open",
         "is_there": "whether the scan shows the PoI",
         "detects": f"whether it is there and a label has a probability of at least {float(least):g}"
         ": only then write the look",

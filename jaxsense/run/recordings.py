@@ -92,7 +92,6 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
     """Checks the looks of one sensor; returns its scans along the sensor's rays."""
     _require_shape(found, f"{sensor.name}_poses", ("C", 3))
     name, angles = f"{sensor.name}_scans", f"{sensor.name}_angles"
-    channels = () if sensor.channels == 1 else (sensor.channels,)
     if name in found and sensor.channels == 3 and found[name].dtype.kind in "iu":
         expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
         raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
@@ -101,7 +100,7 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
         _require_shape(found, angles, ("A",))
         rays, others = found[angles], ""
         resampling.require_angles(f"angles of {sensor.name}", rays)
-    _require_shape(found, name, ("C", len(rays), *channels), others)
+    _require_shape(found, name, ("C", len(rays), *sensor.shape[1:]), others)
     _require_valid(found[name], sensor)
     scans = _closed(sensor, rays, found[name])
     return recorded.resample(sensor, rays, scans) if angles in found else scans
@@ -118,7 +117,8 @@ def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray
 
 def _require_valid(scans: np.ndarray, sensor: Sensor) -> None:
     """Raises `ValueError` if a reading is negative, or a brightness above 1."""
-    is_wrong = ~np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32))) & ~np.isnan(scans)
+    is_valid = np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32)))
+    is_wrong = ~is_valid & ~np.isnan(scans)
     if is_wrong.any():
         returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
         most = " and at most 1, linear RGB" if sensor.channels == 3 else ""

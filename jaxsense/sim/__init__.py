@@ -19,6 +19,7 @@ from jaxsense.sim.arena import make_layout as make_layout
 from jaxsense.sim.arena import place as place
 from jaxsense.sim.arena import random_layout as random_layout
 from jaxsense.sim.arena import robot_poses as robot_poses
+from jaxsense.sim.domain import Domain as Domain
 from jaxsense.sim.light import Light as Light
 from jaxsense.sim.light import random_light as random_light
 from jaxsense.sim.raycast import CrossSection as CrossSection

@@ -44,8 +44,12 @@ def resample(
     if readings.shape[1:2] != angles.shape:
         expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
         raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
-    window = _require_dense(sensor, angles)
-    _, step = sensor.steps
+    (_, step), between = sensor.steps, resampling.median_step(angles)
+    if between > resampling.MAX_STEPS * step:
+        expected = f"must be at most {np.degrees(resampling.MAX_STEPS * step):.2f} degrees"
+        found = f"step between the rays of {sensor.name} = {np.degrees(between):.2f} degrees"
+        raise ValueError(f"{found}: {expected}")
+    window = (sensor.window - 1) * sensor.stride + 1
     recorded = _longest(resampling.covered(sensor.angles, angles, step))
     if len(recorded) < window:
         needed, found = (
@@ -63,20 +67,6 @@ def resample(
         step=step,
     )
     return np.moveaxis(found, 0, 1)
-
-
-def _require_dense(sensor: Sensor, angles: Float[np.ndarray, " A"]) -> int:
-    """How many of the sensor's rays a window spans.
-
-    Raises `ValueError` if there are too few recorded rays, or they are too far apart.
-    """
-    most, step = resampling.MAX_STEPS * sensor.steps[1], resampling.median_step(angles)
-    if step > most:
-        expected = f"must be at most {np.degrees(most):.2f} degrees"
-        raise ValueError(
-            f"step between the rays of {sensor.name} = {np.degrees(step):.2f} degrees: {expected}"
-        )
-    return (sensor.window - 1) * sensor.stride + 1
 
 
 def _longest(is_recorded: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:

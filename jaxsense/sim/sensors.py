@@ -97,7 +97,9 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         rays = windows.reshape(*windows.shape[:-1], self.window, self.channels)
         return rays if self.angles[0] > self.angles[-1] else rays[..., ::-1, :]
 
-    def is_valid(self, readings: Float[Array, "*axes"]) -> Bool[Array, "*axes"]:
+    def is_valid(
+        self, readings: Float[Array | np.ndarray, "*axes"]
+    ) -> Bool[Array | np.ndarray, "*axes"]:
         """Tells which readings the sensor can make; a beam without a return is infinitely long."""
         most = jnp.inf if self.measures_distance else jnp.finfo(readings.dtype).max
         return (readings >= 0) & (readings <= most)
@@ -115,6 +117,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     def angles(self) -> Float[np.ndarray, "B"]:
         """Angles of the rays in the robot's frame, in radians, in the order of the readings."""
         return self.rays.angles
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the readings of a whole scan."""
+        return (len(self.angles), *[self.channels] * (self.channels > 1))
 
     @property
     def is_on_top(self) -> bool:
@@ -173,7 +180,9 @@ class Camera(Sensor):
 
     config: CameraConfig
 
-    def is_valid(self, readings: Float[Array, "*axes"]) -> Bool[Array, "*axes"]:
+    def is_valid(
+        self, readings: Float[Array | np.ndarray, "*axes"]
+    ) -> Bool[Array | np.ndarray, "*axes"]:
         """See `Sensor.is_valid`."""
         return (readings >= 0) & (readings <= 1 + _ROUNDING)
 

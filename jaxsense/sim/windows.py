@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
 from jaxsense.core import checks
 from jaxsense.sim.sensors import Sensor
@@ -62,9 +62,7 @@ def cut_out(
       ValueError: if a reading is negative, not a number or not real, or the bearing is not within
         -pi and pi.
     """
-    channels = () if sensor.channels == 1 else (sensor.channels,)
-    shape = (len(sensor.angles), *channels)
-    checks.require_shape(f"readings of {sensor.name}", readings, shape)
+    checks.require_shape(f"readings of {sensor.name}", readings, sensor.shape)
     is_turn = "must be from -pi to pi: it is in radians"
     checks.require("bearing", bearing, lambda x: np.abs(x) <= np.pi, is_turn)
     dtype = jnp.result_type(readings)
@@ -98,16 +96,6 @@ def wrapped(bearing: Float[Array, ""]) -> Float[Array, ""]:
       bearing: in radians.
     """
     return bearing - 2 * jnp.pi * jnp.round(bearing / (2 * jnp.pi))
-
-
-def is_in_view(sensor: Sensor, bearing: Float[Array, ""]) -> Bool[Array, ""]:
-    """Tells whether a bearing is within the sensor's field of view.
-
-    Args:
-      sensor: the sensor.
-      bearing: in the robot's frame, in radians.
-    """
-    return (bearing >= sensor.angles.min()) & (bearing <= sensor.angles.max())
 
 
 def as_window(sensor: Sensor, readings: Float[Array, "window *channels"]) -> Float[Array, "F"]:

@@ -7,7 +7,7 @@ import jax
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
-from jaxsense.models import Models, make_agent, make_bayes, make_domains
+from jaxsense.models import Models
 from jaxsense.tasks import archive
 
 DATA = Path(__file__).parent / "data"
@@ -57,12 +57,7 @@ def load_pretrained(preset: str) -> tuple[Config, Models]:
     config = from_plain(about["config"])
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     parts = {name: archive.fill(arrays, name, getattr(shapes, name)) for name in _PARTS}
-    return config, Models(
-        **parts,
-        bayes=make_bayes(config),
-        agent=make_agent(config),
-        domains=make_domains(config),
-    )
+    return config, models.make_models(config, **parts)
 
 
 def write(file: Path, config: Config, trained: Models, made: Origin) -> None:

@@ -9,7 +9,7 @@ from jaxsense.dqn.map_mdp import Looks, MapMdp
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
-from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.models import Models, make_models
 from jaxsense.training.detections import Detections
 from jaxsense.vae import novelty
 
@@ -28,15 +28,13 @@ def models_of(
       look_values: for each modality, the values of looks.
       q_networks: for each modality, parameters of the Q-network.
     """
-    return Models(
+    return make_models(
+        config,
         detectors=(),
-        domains=(),
         jmvae={},
         fusion=fusion,
-        bayes=make_bayes(config),
         novelty=novelty.independent(len(config.modalities)),
         look_values=look_values,
-        agent=make_agent(config),
         q_networks=q_networks,
         tours=(),
     )

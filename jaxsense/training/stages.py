@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.models import Models, make_agent, make_bayes, make_domains
+from jaxsense.models import Models, make_models
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import (
@@ -117,15 +117,13 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
       outputs: by the name of the stage.
       config: all settings.
     """
-    return Models(
+    return make_models(
+        config,
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
-        domains=make_domains(config),
         jmvae=outputs["best_jmvae"],
         fusion=outputs["fusion"],
-        bayes=make_bayes(config),
         novelty=outputs["novelty"],
         look_values=outputs["look_values"],
-        agent=make_agent(config),
         q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
         tours=tuple(outputs[stage.name] for stage in agents.tour_stages(config)),
     )

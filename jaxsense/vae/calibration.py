@@ -1,6 +1,8 @@
 """Quality of predicted probabilities: likelihood, calibration error, reliability diagram."""
 
+import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Float, Int
 
 from jaxsense.core import checks
@@ -8,6 +10,25 @@ from jaxsense.core.types import Reliability
 
 MIN_PROBABILITY = 1e-12
 _BINS = 15
+_MOST = 4.0  # and its inverse: factors that are tried
+
+
+def sharpness(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Array, ""]:
+    """The factor on logits, of 257 from 1/4 to 4, by which the labels are the most likely.
+
+    Its inverse is the temperature of Guo et al. 2017, Sec. 4.2.
+
+    Args:
+      logits: `[L, S]` log-probabilities of the labels, up to a constant of each look.
+      labels: `[S]` int32 true labels.
+    """
+
+    def loss(factor: jax.Array) -> jax.Array:
+        scaled = factor * logits
+        return optax.softmax_cross_entropy_with_integer_labels(scaled, labels, 0).mean()
+
+    each = jnp.geomspace(1 / _MOST, _MOST, 257)
+    return each[jnp.argmin(jax.lax.map(loss, each))]
 
 
 def negative_log_likelihood(

@@ -13,10 +13,10 @@ from jaxsense.config import DetectorConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Key, product, pytree
+from jaxsense.vae import calibration
 from jaxsense.vae import gate as gates
 from jaxsense.vae.gate import Gate
 
-_MAX_TEMPERATURE = 4.0
 _NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
 _MIN_PROBABILITY = 1e-9  # whose logarithm counts
 
@@ -142,7 +142,7 @@ def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array
       distance: expected distance of the PoI's centre, in metres.
     """
     is_known = gates.is_valid(window, distance)
-    is_there = gates.passes(detector.gate, window, distance)
+    is_there = is_known & (gates.logits(detector.gate, window, distance) >= detector.gate.threshold)
     features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
     return Detection(is_known, is_there, features)
 
@@ -311,13 +311,7 @@ def calibrate(
     checks.require_shape("labels", labels, (len(windows),))
     standard = (windows - detector.offset[None]) / detector.scale
     predicted = networks.apply(_network(detector), detector.params, standard.T)
-
-    def loss(sharpness: jax.Array) -> jax.Array:
-        scaled = sharpness * predicted
-        return optax.softmax_cross_entropy_with_integer_labels(scaled, labels, 0).mean()
-
-    each = jnp.geomspace(1 / _MAX_TEMPERATURE, _MAX_TEMPERATURE, 257)
-    best = each[jnp.argmin(jax.lax.map(loss, each))]
+    best = calibration.sharpness(predicted, labels)
     params = networks.scale_last(_network(detector), detector.params, best)
     return dataclasses.replace(detector, params=params)
 

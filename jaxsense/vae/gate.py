@@ -74,28 +74,14 @@ def logits(
 
 
 def is_valid(window: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
-    """Tells whether all readings of a window, and its distance, are such that a gate can judge it.
+    """Tells whether a gate can judge a window: all numbers are finite, the distance is above 0.
 
     Args:
-      window: see `passes`.
-      distance: see `passes`.
+      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
+      distance: expected distance of the PoI's centre, in metres.
     """
     checks.require_shape("distance", distance, ())
     return jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
-
-
-def passes(gate: Gate, window: Float[Array, " F"], distance: Float[Array, ""]) -> Bool[Array, ""]:
-    """Tells whether a window shows its PoI.
-
-    Args:
-      gate: of the sensor.
-      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
-      distance: expected distance of the PoI's centre, in metres.
-
-    Returns:
-      False if it shows something else, or a number is not finite or the distance not above 0.
-    """
-    return is_valid(window, distance) & (logits(gate, window, distance) >= gate.threshold)
 
 
 @pytree

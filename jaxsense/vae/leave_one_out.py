@@ -13,7 +13,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -21,7 +20,7 @@ from jaxsense.config import JmvaeConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.vae import gaussian
+from jaxsense.vae import calibration, gaussian
 from jaxsense.vae.frames import Scaling
 from jaxsense.vae.gate import Gate
 from jaxsense.vae.jmvae import annealed_beta
@@ -31,7 +30,6 @@ _EMBEDDING = 64  # numbers that a network finds in a look
 _FIRST_ALPHA = 0.1  # before alpha sets in, posteriors of few looks follow and do not draw
 _ALPHA_RAMP = 0.2  # of the training
 _LOG_VARIANCES = -10.0, 6.0
-_MOST_SHARPNESS = 4.0
 
 Drawn = tuple[jax.Array, jax.Array]
 """Rows `[steps, B]`, and noise `[steps, M, D, B, K]`."""
@@ -294,15 +292,9 @@ def calibrate(encoder: Encoder, windows: Float[Array, "S F"], classes: Int[Array
       windows: `[S, F]` single looks that nothing was trained on.
       classes: `[S]` int32 what all looks at their PoIs show together.
     """
-    found = jax.vmap(encoder._log_probabilities)(windows)
+    found = jax.vmap(encoder._log_probabilities, out_axes=-1)(windows)
     labels = jnp.array(encoder.label_of_class)[classes]
-
-    def loss(sharpness: jax.Array) -> jax.Array:
-        losses = optax.softmax_cross_entropy_with_integer_labels(sharpness * found, labels)
-        return jnp.mean(losses)
-
-    each = jnp.geomspace(1 / _MOST_SHARPNESS, _MOST_SHARPNESS, 257)
-    return dataclasses.replace(encoder, sharpness=each[jnp.argmin(jax.lax.map(loss, each))])
+    return dataclasses.replace(encoder, sharpness=calibration.sharpness(found, labels))
 
 
 def _columns(network: MLP, params: Params, x: jax.Array) -> jax.Array:

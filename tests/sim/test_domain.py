@@ -110,7 +110,7 @@ def test_a_sensor_of_one_ray_has_a_domain():
 
 
 def test_whole_turns_leave_a_bearing_as_it_is():
-    bearings = np.float32([-np.pi, -3.0, -0.2, 0.0, 0.2, 1.5, 3.0])
+    bearings = np.array([-np.pi, -3.0, -0.2, 0.0, 0.2, 1.5, 3.0], np.float32)
     np.testing.assert_array_equal(windows.wrapped(jnp.asarray(bearings)), bearings)
     turned = windows.wrapped(jnp.asarray(bearings[1:] + np.float32(TURN)))
     np.testing.assert_allclose(turned, bearings[1:], atol=1e-6)
@@ -158,11 +158,11 @@ def test_a_bearing_of_a_turn_more_is_the_same_look(m):
     rng = np.random.default_rng(0)
     scan = rng.uniform(0.3, 0.9, SCANS[sensor.name].shape).astype(np.float32)
     before, after = (
-        MODELS.detect(m, sensor, scan, bearing, jnp.float32(0.9)) for bearing in (0.2, 0.2 + TURN)
+        MODELS.detect(m, sensor, scan, jnp.float32(b), jnp.float32(0.9)) for b in (0.2, 0.2 + TURN)
     )
     assert bool(after.is_known & after.is_there)
     np.testing.assert_allclose(after.features, before.features, atol=1e-6)
-    beyond = MODELS.detect(m, sensor, scan, 0.2, jnp.float32(1.3))
+    beyond = MODELS.detect(m, sensor, scan, jnp.float32(0.2), jnp.float32(1.3))
     assert not bool(beyond.is_known | beyond.is_there)
     np.testing.assert_array_equal(beyond.features, 0.5)
 
