@@ -27,9 +27,10 @@ def imported(name: str, package: str) -> Any:
     try:
         return importlib.import_module(name if is_copied else f"{package}.{name}")
     except ModuleNotFoundError as error:
-        is_absent = error.name in (name, "jaxsense")
-        how = "copy it next to this file" if is_absent else f"pip install {error.name}"
-        sys.exit(f"needs {f'{name}.py' if is_absent else error.name}: {how}")
+        absent = str(error.name).partition(".")[0]
+        if absent in (name, "jaxsense"):
+            sys.exit(f"needs {name}.py: copy it next to this file")
+        sys.exit(f"needs {absent}: pip install {absent}")
 
 
 load = imported("robot", "jaxsense.interfaces").load

@@ -58,12 +58,22 @@ def _read(path: Path | str | BinaryIO) -> tuple[dict[str, Any], dict[str, bytes]
     if isinstance(path, str | Path) and not Path(path).is_file():
         raise FileNotFoundError("no such file")
     with zipfile.ZipFile(path) as files:
-        text, whole = files.getinfo("contents.json"), sum(x.file_size for x in files.infolist())
-        for size, most in ((text.file_size, MOST_TEXT), (whole, MOST_BYTES)):
-            if size > most:
-                raise ValueError(f"{size} bytes when unpacked: must be at most {most}")
-        contents = json.loads(files.read(text))
-        return contents, {name: files.read(f"{name}.onnx") for name in contents["programs"]}
+        every = files.infolist()
+        size, of_text = sum(x.file_size for x in every), files.getinfo("contents.json").file_size
+        if size > MOST_BYTES or of_text > MOST_TEXT:
+            must_be = f"must be at most {MOST_BYTES}, and {MOST_TEXT} in contents.json"
+            raise ValueError(f"{size} bytes when unpacked, {of_text} in contents.json: {must_be}")
+        # zipfile bounds what it unpacks of no other kind.
+        if not {x.compress_type for x in every} <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise ValueError("packed in another way than by zlib")
+        contents = json.loads(_unpacked(files, "contents.json"))
+        return contents, {name: _unpacked(files, f"{name}.onnx") for name in contents["programs"]}
+
+
+def _unpacked(files: zipfile.ZipFile, name: str) -> bytes:
+    with files.open(name) as file:
+        # Without a number, it would unpack more than the size that was checked.
+        return file.read(files.getinfo(name).file_size)
 
 
 def checked(

@@ -4,6 +4,8 @@ import contextlib
 import json
 import os
 import re
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -15,8 +17,8 @@ from jaxsense.interfaces import robot
 from jaxsense.sim import sensors
 
 
-def packed(path, **files):
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+def packed(path, kind=zipfile.ZIP_DEFLATED, **files):
+    with zipfile.ZipFile(path, "w", kind) as packed:
         for name, content in files.items():
             packed.writestr(name.replace("__", "."), content)
 
@@ -35,8 +37,14 @@ ONE = {"programs": {"weigh": {"inputs": {}, "outputs": {}}}}
         ({"contents__json": json.dumps({"programs": ["weigh"]}), "weigh__onnx": ""}, "AttributeE"),
         ({"contents__json": json.dumps(ONE)}, "no item named 'weigh.onnx'"),
         ({"contents__json": json.dumps(ONE), "weigh__onnx": b"\x1b[2J"}, "InvalidProtobuf"),
-        ({"contents__json": " " * (robot.MOST_TEXT + 1)}, "must be at most 4194304"),
-        ({"contents__json": "{}", "big": bytes(robot.MOST_BYTES)}, "must be at most 134217728"),
+        (
+            {"contents__json": " " * (robot.MOST_TEXT + 1)},
+            "4194305 in contents.json: must be at most",
+        ),
+        (
+            {"contents__json": "{}", "big": bytes(robot.MOST_BYTES)},
+            "134217730 bytes when unpacked, 2 in contents.json",
+        ),
     ],
 )
 def test_what_is_no_archive_is_one_line(tmp_path, files, reason):
@@ -45,6 +53,24 @@ def test_what_is_no_archive_is_one_line(tmp_path, files, reason):
         robot.load(path)
     assert str(raised.value).startswith(f"{path}: must be a file of `jaxsense export` (")
     assert str(raised.value).isprintable()
+
+
+def test_no_more_is_unpacked_than_an_archive_says(tmp_path):
+    about, zeros = {"contents__json": json.dumps(ONE)}, bytes(2**28)
+    packed(path := tmp_path / "deflated.zip", **about, weigh__onnx=zeros)
+    content = bytearray(path.read_bytes())
+    # The size in the last entry of the table of contents.
+    struct.pack_into("<I", content, content.rindex(b"PK\1\2") + 24, 100)
+    path.write_bytes(content)
+    packed(other := tmp_path / "bzip2.zip", zipfile.ZIP_BZIP2, **about, weigh__onnx=zeros[: 2**20])
+    del zeros
+    tracemalloc.start()
+    for each, reason in ((path, "Bad CRC-32"), (other, "packed in another way than by zlib")):
+        with pytest.raises(ValueError, match=reason):
+            robot.load(each)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
 
 
 def test_a_damaged_archive_is_one_line(file, tmp_path):
