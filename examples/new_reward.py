@@ -7,13 +7,15 @@ import jax.numpy as jnp
 
 import jaxsense
 from jaxsense import Belief, dqn, pytree
+from jaxsense.config import MdpConfig
 
 
 @pytree
 class Confident:
     """Rewards a look for the probability of the most likely class that it adds, minus a cost."""
 
-    look_cost: float = 0.05
+    config: MdpConfig
+    is_of_labels = False  # classes count, not only the labels of a sensor
 
     def information(self, belief: Belief, probabilities: jax.Array) -> jax.Array:
         """Probability of the most likely class, `[]`."""
@@ -21,15 +23,15 @@ class Confident:
 
     def of_gain(self, gain: jax.Array) -> jax.Array:
         """The reward of a look, `[...]`, by what it has added."""
-        return gain - self.look_cost
+        return gain - self.config.look_cost
 
 
 if __name__ == "__main__":
     config, models = jaxsense.load_pretrained("default")  # or those of `jaxsense.load("runs/...")`
     key, settings = jax.random.key(0), jaxsense.PRESETS["smoke"].dqn  # a short training
     looks = jaxsense.Bank(jaxsense.detections(key, config, models, samples=64))
-    mdp = dataclasses.replace(jaxsense.make_mdp(config, models, looks), reward=Confident())
-    learning = models.agent.environment(mdp, modality=0)
+    mdp, reward = jaxsense.make_mdp(config, models, looks), Confident(config.mdp)
+    learning = models.agent.environment(dataclasses.replace(mdp, reward=reward), modality=0)
     settings = dataclasses.replace(settings, target_period=5, epsilon_decay=0.9)
     state, info = jax.jit(lambda key: dqn.train(key, learning, settings))(key)
     for name, part in (("first", slice(1, 16)), ("last", slice(-15, None))):

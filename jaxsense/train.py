@@ -146,7 +146,7 @@ def main(
     first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only these two lines.
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
-    trust = " --trust" if arguments.config.sensors else ""
+    trust = " --trust" if arguments.config.named_code else ""
     say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
 
 
@@ -272,7 +272,7 @@ def _train(
     except Stopped:
         if jax.process_index() == 0:
             again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
-            again += " --trust" if settings.config.sensors else ""
+            again += " --trust" if settings.config.named_code else ""
             again += " with the same processes" if jax.process_count() > 1 else ""
             output.complain(f"Stopped; all training so far is saved. To resume: {again}")
         # Other processes may be blocked in a collective; wait only briefly.

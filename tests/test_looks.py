@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import looks
+from jaxsense import looks, mission
 from jaxsense.config import PRESETS, FilterConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
@@ -35,6 +35,25 @@ def numbered_bank():
     place = np.arange(3)[:, None] + np.arange(5) / 10
     stacked = (np.stack([place, np.full_like(place, m)], axis=-1) for m in range(2))
     return tuple(jnp.asarray(x, jnp.float32) for x in stacked)
+
+
+def test_what_is_made_twice_from_equal_settings_shares_its_programs(models):
+    again = PRESETS["smoke"], JmvaeConfig(hidden=(8,))
+    config = replace(again[0], jmvae=again[1])
+    read_mdp = jax.jit(lambda mdp: mdp.config.min_increase)
+    read_mission = jax.jit(lambda mission: mission.config.mdp.min_increase, static_argnums=0)
+    for each in (CONFIG, config):
+        read_mdp(looks.make_mdp(each, models))
+        read_mission(mission.make_mission(each, {"none": no_look}))
+    assert read_mdp._cache_size() == read_mission._cache_size() == 1
+    other = replace(config, arena=replace(config.arena, side=4.0))
+    read_mdp(looks.make_mdp(other, models))
+    read_mission(mission.make_mission(config))
+    assert read_mdp._cache_size() == read_mission._cache_size() == 2
+
+
+def no_look(key, models, known):
+    return jnp.zeros(4)
 
 
 @pytest.mark.parametrize("modality", [0, 1])

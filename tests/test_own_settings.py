@@ -21,6 +21,7 @@ from jaxsense.config import (
     Attribute,
     Config,
     ConfigError,
+    MdpConfig,
     SensorConfig,
     Shape,
     TeamConfig,
@@ -28,6 +29,7 @@ from jaxsense.config import (
     as_plain,
     from_plain,
 )
+from jaxsense.dqn import rewards
 
 TEMPERATURE = {"temperature": Attribute({"cold": 5.0, "hot": 60.0})}
 WARM = ArenaConfig(attributes=TEMPERATURE, classes=("red cube hot", "green cylinder cold"))
@@ -276,6 +278,21 @@ def test_a_sensor_that_does_not_fit_is_named(own_sensors, function, expected):
     with pytest.raises(ConfigError) as error:
         sim.sensors.make(OWN)
     assert expected in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("made", "expected"),
+    [
+        (None, "mdp.reward = 'own_sensors:reward': must be a function that can be imported"),
+        (3, "mdp.reward = int: must be a Reward; it lacks is_of_labels, information, of_gain"),
+        (rewards.Nats, "mdp.reward = Nats: must be a Reward, not its class"),
+    ],
+)
+def test_a_reward_that_is_none_is_named(own_sensors, made, expected):
+    if made is not None:
+        own_sensors.reward = lambda config: made
+    with pytest.raises(ValueError, match=expected):
+        rewards.make(MdpConfig(reward="own_sensors:reward"))
 
 
 def choices_of_all_sections():

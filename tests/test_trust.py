@@ -87,6 +87,19 @@ def test_commands_need_an_option(run, command, capsys):
         command(run, "--trust")
 
 
+def test_a_run_whose_reward_is_code_is_refused(tmp_path):
+    smoke = PRESETS["smoke"]
+    config = dataclasses.replace(smoke, mdp=dataclasses.replace(smoke.mdp, reward="trap:make"))
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
+        path = created.path
+    with pytest.raises(
+        ConfigError, match=r"mdp\.reward = 'trap:make': names code that would be run"
+    ):
+        jaxsense.load(path)
+    with pytest.raises(SprungError):
+        jaxsense.load(path, trust=True)
+
+
 def test_what_the_users_own_program_names_needs_none(run, tmp_path):
     with pytest.raises(SprungError):
         train.main(["--preset", "smoke", "--out", str(tmp_path / "new")], change)

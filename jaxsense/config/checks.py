@@ -7,9 +7,10 @@ that settings from Python, JSON and command lines pass one check.
 import contextlib
 import dataclasses
 import functools
+import importlib
 import inspect
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -193,6 +194,30 @@ def require_function(field: str, value: object, number: int, expected: str) -> N
         signature.bind(*range(number))
     except TypeError:
         raise ConfigError(field, value, expected) from None
+
+
+def is_function_name(path: str) -> bool:
+    """Whether a text can name a function, as `package.module:function`."""
+    module, _, function = path.partition(":")
+    return function.isidentifier() and all(part.isidentifier() for part in module.split("."))
+
+
+def named_function(field: str, path: str) -> Callable[..., object]:
+    """Imports a function that settings name.
+
+    Args:
+      field: name of the field.
+      path: its value, as `package.module:function`.
+
+    Raises:
+      ConfigError: if it cannot be imported.
+    """
+    module, _, function = path.partition(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        reason = f"must be a function that can be imported ({error})"
+        raise ConfigError(field, path, reason) from None
 
 
 def require_32_bits() -> None:

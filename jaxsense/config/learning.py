@@ -4,7 +4,7 @@ import itertools
 import math
 from typing import Literal
 
-from jaxsense.config.checks import limited, require
+from jaxsense.config.checks import is_function_name, limited, require
 from jaxsense.config.section import Section, Sizes, Traced
 
 PROFILE = 64
@@ -159,9 +159,10 @@ class MdpConfig(Section, place="mdp"):
 
     unseen_variance: Traced[float] = limited(20.0, above=0, at_most=_MAX_WEIGHT)
     """Variance of each latent dimension of the prior, the belief before any look."""
-    reward: Literal["paper", "nats"] = "paper"
+    reward: str = "paper"
     """Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
-    `nats`: the information gained about the class, minus `look_cost`."""
+    `nats`: the information gained about the class, minus `look_cost`. `package.module:function`:
+    the `dqn.Reward` that this function makes from an `MdpConfig`."""
     look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
     """Cost of a look, in nats; only with the reward `nats`."""
     min_increase: Traced[float] = limited(0.05, at_least=0)
@@ -171,6 +172,11 @@ class MdpConfig(Section, place="mdp"):
     """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
     """Whether to exclude starts where every modality has seen every PoI, or none has seen any."""
+
+    def check(self) -> None:
+        """Checks that `reward` is known or can be the name of a function; raises `ConfigError`."""
+        is_named = self.reward in ("paper", "nats") or is_function_name(self.reward)
+        require(is_named, self, "reward", "must be paper, nats or package.module:function")
 
 
 class TravelConfig(Section, place="team.travel"):

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 
-from jaxsense.config.checks import ConfigError, limited, require
+from jaxsense.config.checks import ConfigError, is_function_name, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.objects import COLOURS, SHAPES, Attribute, Shape, require_words
 from jaxsense.config.section import Checked, Section, Traced
@@ -239,8 +239,7 @@ class SensorConfig(Checked, place="sensor"):
 
     def check(self) -> None:
         """Checks that `make` can be the name of a function; raises `ConfigError`."""
-        module, _, function = self.make.partition(":")
-        is_name = function.isidentifier() and all(p.isidentifier() for p in module.split("."))
+        is_name = is_function_name(self.make)
         require(is_name, self, "make", "must be package.module:function")
 
 

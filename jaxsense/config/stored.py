@@ -51,14 +51,14 @@ def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def require_trust(config: Config) -> None:
-    """Raises an error if settings name custom sensors, whose code would run.
+    """Raises an error if settings name custom sensors or a custom reward, whose code would run.
 
     Raises:
-      ConfigError: if there are custom sensors.
+      ConfigError: if they do.
     """
-    for name, sensor in config.sensors.items():
+    for field, path in config.named_code.items():
         reason = "names code that would be run; pass --trust (trust=True) if you trust it"
-        raise ConfigError(f"sensors.{name}.make", sensor.make, reason)
+        raise ConfigError(field, path, reason)
 
 
 def _made(kind: object, stored: object, base: object, place: str) -> object:

@@ -60,6 +60,12 @@ class Config(Section):
     navigation: NavigationConfig = NavigationConfig()
     mission: MissionConfig = MissionConfig()
 
+    @property
+    def named_code(self) -> dict[str, str]:
+        """Functions that the settings name, by their fields, and that whoever uses them runs."""
+        named = {f"sensors.{name}.make": sensor.make for name, sensor in self.sensors.items()}
+        return {**named, "mdp.reward": self.mdp.reward} if ":" in self.mdp.reward else named
+
     def check(self) -> None:
         """Checks relations between sections; raises `ConfigError`."""
         self._check_modalities()

@@ -1,12 +1,13 @@
 """Rewards of looks: the paper's, or nats. Another kind is a new class like `Reward`."""
 
-from typing import Protocol
+from typing import Protocol, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import MdpConfig
+from jaxsense.config.checks import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, pytree
 
@@ -94,9 +95,18 @@ class Nats:
 
 
 def make(config: MdpConfig) -> Reward:
-    """The reward that the settings name."""
-    rewards = {"paper": Paper(config.min_increase), "nats": Nats(config.look_cost)}
-    return rewards[config.reward]
+    """Makes the reward that the settings name.
+
+    Raises:
+      ConfigError: if a function that they name cannot be imported.
+      ValueError: if it does not make a `Reward`.
+    """
+    known = {"paper": Paper(config.min_increase), "nats": Nats(config.look_cost)}
+    if config.reward in known:
+        return known[config.reward]
+    own = cast("Reward", named_function("mdp.reward", config.reward)(config))
+    checks.require_members("mdp.reward", own, Reward)
+    return own
 
 
 def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:

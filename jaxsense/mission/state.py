@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.config.frozen import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
@@ -203,9 +204,9 @@ class Record:
     clearance: Float[Array, ""]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Mission:
-    """Arenas, settings and policies that missions share. Static under `jit`.
+    """Arenas, settings and policies that missions share. Static under `jit`, compared by value.
 
     Attributes:
       world: the simulation, with contacts or without.
@@ -217,7 +218,7 @@ class Mission:
     world: World
     free_arena: Arena
     config: Config
-    policies: dict[str, Policy]
+    policies: FrozenDict[str, Policy]
 
     def policy(self, name: str) -> int:
         """The index of a policy.
@@ -270,7 +271,7 @@ def make_mission(
         free_arena=free
         or arenas_of.build(config.arena, sensors.on_top(config, config.carried), obstacles=False),
         config=config,
-        policies=table(policies),
+        policies=FrozenDict(table(policies)),
     )
 
 

@@ -121,7 +121,7 @@ def keep_programs(
     try:
         directory = directory.expanduser()
         kept.use_cache(directory)
-        if config.sensors or has_own_code:
+        if config.named_code or has_own_code:
             return None
         return Kept(directory, jax.tree.structure(config))
     except (OSError, RuntimeError) as error:

@@ -43,7 +43,7 @@ def render(
         "report.html.jinja",
         run=run,
         argument=lambda path: shlex.quote(str(path)),
-        trust=" --trust" if config.sensors else "",
+        trust=" --trust" if config.named_code else "",
         summary=summary,
         remarks=compare.remarks(summary),
         cards=tables.cards(summary),

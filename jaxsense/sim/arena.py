@@ -50,6 +50,8 @@ class Layout:
 class Arena:
     """A compiled arena, shared by all its layouts. Static under `jit`, compared by identity.
 
+    `build` returns the same one for equal settings.
+
     Attributes:
       config: the settings it was built from.
       mj_model: the model in C MuJoCo.
@@ -112,6 +114,13 @@ def build(
       ConfigError: if JAX computes in 64 bits.
     """
     require_32_bits()
+    return _built(config, lidar_robots, contacts, obstacles)
+
+
+@functools.cache
+def _built(
+    config: ArenaConfig, lidar_robots: tuple[bool, ...], contacts: bool, obstacles: bool
+) -> Arena:
     mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
     # By default MJX takes the first device of all processes.

@@ -7,7 +7,6 @@ all sensors alike.
 
 import abc
 import dataclasses
-import importlib
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
+from jaxsense.config.checks import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static
 from jaxsense.sim import amiro, disturbances, raycast
@@ -277,13 +277,7 @@ def on_top(config: Config, carried: tuple[str, ...]) -> tuple[bool, ...]:
 def _own(name: str, config: Config) -> Sensor:
     """Makes a custom sensor and checks it."""
     path, field = config.sensors[name].make, f"sensors.{name}"
-    module, _, function = path.partition(":")
-    try:
-        make = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        reason = f"must be a function that can be imported ({error})"
-        raise ConfigError(f"{field}.make", path, reason) from None
-    sensor = make(config)
+    sensor = named_function(f"{field}.make", path)(config)
     if not isinstance(sensor, Sensor):
         kind = type(sensor).__name__
         raise ConfigError(f"{field}.make", path, f"must return a jaxsense.sim.Sensor, not {kind}")

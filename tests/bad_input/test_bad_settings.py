@@ -438,7 +438,7 @@ CHANGES = [
     ),
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
     ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of numbers, each 0 or"),
-    ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be one of paper, nats"),
+    ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be paper, nats or package.module:function"),
     (
         {
             "dqn.task": "team",

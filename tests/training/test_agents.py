@@ -1,6 +1,8 @@
 """Stages of agents: the values of looks, Q-learning and tours."""
 
 import dataclasses
+import sys
+import types
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +14,7 @@ from tiny import KEY, TINY, stage_of
 
 from jaxsense import models
 from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import training as dqn
 from jaxsense.training import comparison
 from jaxsense.training.detections import Detections
@@ -26,8 +28,27 @@ def detections_of(bank, held_out: Any = (), starts: Any = ()) -> Detections:
     return Detections(bank, held_out, starts, nothing)
 
 
-@pytest.mark.parametrize("reward", ["nats", pytest.param("paper", marks=pytest.mark.slow)])
-def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
+@pytree
+class Confident:
+    """Rewards the probability of the most likely class that a look adds."""
+
+    look_cost: Any
+    is_of_labels = False
+
+    def information(self, belief, probabilities):
+        return probabilities.max()
+
+    def of_gain(self, gain):
+        return gain - self.look_cost
+
+
+@pytest.mark.parametrize(
+    "reward", ["nats", "own_rewards:confident", pytest.param("paper", marks=pytest.mark.slow)]
+)
+def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward, monkeypatch):
+    module = types.ModuleType("own_rewards")
+    module.confident = lambda config: Confident(config.look_cost)  # pyright: ignore
+    monkeypatch.setitem(sys.modules, "own_rewards", module)
     mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
     fusion = dataclasses.replace(TINY.jmvae, fusion="filter", latent_size=1)
     config = dataclasses.replace(TINY, jmvae=fusion, mdp=mdp)
@@ -45,6 +66,9 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
     if reward == "nats":
         # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
         expected = first = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
+    elif reward == "own_rewards:confident":
+        # 1 / 3 before; 1 after a green one, and 1 / 2 after each of two red ones.
+        expected = first = [1 / 3 + 2 / 3 / 2 - 1 / 3 - 0.125, -0.125]
     else:
         # Before, a variance of 1 + that of the three means. After a green one 1, and after a red
         # one 1 + 12 / 4 = 4.
