@@ -1,6 +1,7 @@
 """`jaxsense COMMAND`: which command runs, what it says of itself, and the demo's page."""
 
 import importlib
+import os
 import re
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import jaxsense
 from jaxsense import __main__ as commands
 from jaxsense import demo, export, mission, task_list, tasks, train
 from jaxsense.config import ConfigError, options
-from jaxsense.run import rundir
+from jaxsense.run import output, rundir
 from jaxsense.run.missions import Played
 from jaxsense.summary.read import NotFinishedError
 
@@ -320,3 +321,33 @@ def test_wheel_and_sdist_run_without_the_source(tmp_path):
         version = f"jaxsense {jaxsense.__version__}\n"
         for start in (["-m", "jaxsense"], [str(target / "bin" / "jaxsense")]):
             assert run(sys.executable, *start, "--version", **away) == version
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("Unable to allocate 8. EiB"), "Unable to allocate 8. EiB"),
+        (
+            jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: 400 bytes.\nMore"),
+            "RESOURCE_EXHAUSTED: 400",
+        ),
+    ],
+)
+def test_a_program_without_enough_memory_ends_in_one_line(error, told, monkeypatch, capsys):
+    def main():
+        raise error
+
+    monkeypatch.setattr(os, "_exit", sys.exit)
+    with pytest.raises(SystemExit) as stop:
+        output.run(main)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 1
+    assert line.startswith(f"Not enough memory: lower the sizes in the settings ({told}")
+
+
+def test_other_errors_of_programs_are_not_about_memory():
+    def main():
+        raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: no")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="no"):
+        output.run(main)

@@ -47,7 +47,7 @@ def test_rows_of_settings(generate):
         "| `arena.num_pois` | 3 | a whole number from 1 to 64 | Number of",
         "| `lidar.range_noise` † | 0.01 | a number, at least 0 | Standard",
         "| `robots` | none | 1 to 64 names; or none | Sensors",
-        "| `jmvae.hidden` | 64, 64 | 1 or more whole numbers, at least 1 | Sizes",
+        "| `jmvae.hidden` | 64, 64 | 1 or more whole numbers from 1 to 65,536 | Sizes",
         "| `team.num_pois` | 3, 8 | 2 whole numbers from 1 to 64 | Minimum",
         "| `jmvae.fusion` | `in_place` | `in_place` or `filter` | How",
         "| `mission.redecides` † | on | on or off | Whether",

@@ -1,22 +1,22 @@
 """Settings of learning: detectors, the JMVAE, the MDPs and their Q-networks."""
 
-import itertools
 import math
 from typing import Literal
 
 from jaxsense.config.checks import is_function_name, limited, require
-from jaxsense.config.section import Section, Sizes, Traced
+from jaxsense.config.section import Section, Traced
 
 PROFILE = 64
 """Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""
 _MAX_BLOCKS = 32
 _MAX_WEIGHT = 1_000_000
+_MAX_UNITS = 65_536  # of a layer; XLA aborts where a product of sizes overflows
 
 
 class DetectorConfig(Section, place="detector"):
     """The detectors, which classify scanlines; f_x and f_w in the paper."""
 
-    hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
+    hidden: tuple[int, ...] = limited((64, 64), at_least=1, at_most=_MAX_UNITS, min_items=1)
     """Sizes of the hidden layers; not used if the JMVAE learns from scans."""
     num_scans: int = limited(98304, at_least=1)
     """Simulated scans to train on, per modality."""
@@ -39,15 +39,6 @@ class DetectorConfig(Section, place="detector"):
         """How many of a number of scans are left to train on, or of groups of them."""
         return number - math.ceil(self.calibration * number)
 
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        return {
-            "hidden": _weights(sizes.window, *self.hidden, sizes.labels),
-            "num_scans num_held_out": max(self.num_scans, self.num_held_out) * sizes.window,
-            "num_repeats": 4 * self.num_repeats * sizes.window,
-            "batch steps": self.batch * max(self.steps, sizes.window),
-        }
-
 
 class JmvaeConfig(Section, place="jmvae"):
     """The joint multi-modal VAE."""
@@ -58,7 +49,7 @@ class JmvaeConfig(Section, place="jmvae"):
     then be `filter`."""
     latent_size: int = limited(2, at_least=1, at_most=256)
     """Dimensions of the latent space, D_z."""
-    hidden: tuple[int, ...] = limited((64, 64), at_least=1, min_items=1)
+    hidden: tuple[int, ...] = limited((64, 64), at_least=1, at_most=_MAX_UNITS, min_items=1)
     """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
@@ -109,33 +100,11 @@ class JmvaeConfig(Section, place="jmvae"):
         """Looks by each sensor at a PoI in one training example."""
         return self.looks if self.reads_scans else 1
 
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        of_learning = self._arrays_of_scans if self.reads_scans else self._arrays_of_detections
-        samples = self.samples_per_class * sizes.classes * sizes.window
-        return {"samples_per_class": samples, **of_learning(sizes)}
-
-    def _arrays_of_detections(self, sizes: Sizes) -> dict[str, int]:
-        encoder = _weights(sizes.labels, *self.hidden, 2 * self.latent_size)
-        return {
-            "hidden": 2**sizes.modalities * encoder,
-            "batch steps": self.batch * self.steps * (self.latent_size + sizes.labels),
-        }
-
-    def _arrays_of_scans(self, sizes: Sizes) -> dict[str, int]:
-        encoder = _weights(sizes.window, *self.hidden, 2 * self.latent_size)
-        groups, noise = self.batch * self.looks, sizes.modalities * self.latent_size
-        return {
-            "hidden": 2 * sizes.modalities * encoder,
-            "batch steps looks": groups * self.steps * noise,
-            "batch looks": groups * max(sizes.window, *self.hidden),
-        }
-
 
 class FilterConfig(Section, place="filter"):
     """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
 
-    hidden: tuple[int, ...] = limited((32,), at_least=1, min_items=1)
+    hidden: tuple[int, ...] = limited((32,), at_least=1, at_most=_MAX_UNITS, min_items=1)
     """Sizes of the hidden layers of each modality's network."""
     looks: int = limited(6, at_least=1, at_most=100)
     """Number of looks in each training sequence."""
@@ -145,13 +114,6 @@ class FilterConfig(Section, place="filter"):
     """Sequences per gradient step."""
     learning_rate: Traced[float] = limited(5e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
-
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        return {
-            "hidden": _weights(sizes.labels, *self.hidden, sizes.classes),
-            "batch looks steps": self.batch * self.looks * self.steps * sizes.labels,
-        }
 
 
 class MdpConfig(Section, place="mdp"):
@@ -209,13 +171,6 @@ class ToursConfig(Section, place="team.tours"):
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
     """Initial learning rate of Adam; decays to zero along a cosine."""
 
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        return {
-            "states tries": self.states * self.tries * sizes.state,
-            "batch steps": self.batch * max(self.steps, 2 * sizes.state),
-        }
-
 
 class TeamConfig(Section, place="team"):
     """The MDP of a team (`dqn.task` = team), in which robots have positions and looks take time."""
@@ -260,7 +215,7 @@ class DqnConfig(Section, place="dqn"):
     observe: Literal["live", "bank"] = "live"
     """Source of looks. `live` casts a scan in the environment's own arena at every step; `bank`
     draws stored detections, which is faster."""
-    hidden: tuple[int, ...] = limited((24, 24), at_least=1, min_items=1)
+    hidden: tuple[int, ...] = limited((24, 24), at_least=1, at_most=_MAX_UNITS, min_items=1)
     """Sizes of the hidden layers."""
     num_envs: int = limited(512, at_least=1)
     """Number of environments that step in parallel."""
@@ -311,17 +266,6 @@ class DqnConfig(Section, place="dqn"):
         shared = math.gcd(self.num_envs, self.batch)
         return shared // math.gcd(shared, _MAX_BLOCKS)
 
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        start = max(sizes.state, sizes.pois * sizes.window)
-        return {
-            "hidden": _weights(sizes.state, *self.hidden, sizes.pois + 1),
-            "replay_capacity": self.replay_capacity * (2 * sizes.state + 3),
-            "num_starts": self.num_starts * sizes.together * start,
-            "num_envs chunk": self.num_envs * max(5 * self.chunk, start),
-            "batch updates chunk": 2 * self.batch * max(self.chunk * self.updates, sizes.state),
-        }
-
 
 class EvaluationConfig(Section, place="evaluation"):
     """Evaluation of the trained policies."""
@@ -343,16 +287,3 @@ class EvaluationConfig(Section, place="evaluation"):
     """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
     value_looks: int = limited(32, at_least=1, at_most=10_000)
     """Sample looks per class that approximate the distribution of looks."""
-
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds."""
-        looks = 2 * self.value_points * self.value_looks
-        return {
-            "num_starts num_repeats": self.num_starts * self.num_repeats * sizes.state,
-            "value_points value_looks": looks * sizes.classes**2,
-        }
-
-
-def _weights(*sizes: int) -> int:
-    """Weights of a dense network with layers of these sizes."""
-    return sum(before * after for before, after in itertools.pairwise(sizes))

@@ -5,15 +5,7 @@ shapes a program is structure.
 """
 
 import dataclasses
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    NamedTuple,
-    TypeVar,
-    dataclass_transform,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform, get_type_hints
 
 import jax
 from jax.core import Tracer
@@ -27,25 +19,6 @@ _ARRAYS = jax.Array | jax.ShapeDtypeStruct
 _LEAF = "leaf"
 Traced = Annotated[T, _LEAF]
 """A setting that only enters the arithmetic: a number, or a JAX array, traced or not."""
-
-
-class Sizes(NamedTuple):
-    """Sizes of arrays that follow from several sections."""
-
-    pois: int
-    """PoIs in a mission."""
-    classes: int
-    """Classes of PoIs."""
-    modalities: int
-    """Trained modalities."""
-    labels: int
-    """Labels of all modalities."""
-    window: int
-    """Numbers in the largest window, or in its frame if the JMVAE learns from scans."""
-    together: int
-    """Looks by each sensor at a PoI that are surveyed together."""
-    state: int
-    """Numbers in a state of the MDP."""
 
 
 @dataclass_transform(frozen_default=True)
@@ -96,10 +69,6 @@ class Section(Checked):
         for name, value in vars(self).items():
             if not any(isinstance(leaf, _ARRAYS) for leaf in jax.tree.leaves(value)):
                 object.__setattr__(self, name, getattr(known, name))
-
-    def arrays(self, sizes: Sizes) -> dict[str, int]:
-        """How many numbers each large array holds, by the fields that determine its size."""
-        return {}
 
 
 def _is_leaf(kind: object) -> bool:

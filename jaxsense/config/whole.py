@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from jaxsense.config.checks import ConfigError, limited, require
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
-    PROFILE,
     DetectorConfig,
     DqnConfig,
     EvaluationConfig,
@@ -26,10 +25,8 @@ from jaxsense.config.scene import (
     SensorConfig,
     ViewpointConfig,
 )
-from jaxsense.config.section import Section, Sizes
+from jaxsense.config.section import Section
 
-_MAX_NUMBERS = 2**32
-"""Numbers of 32 bits in an array or a network, 16 GiB."""
 _MAX_MODALITIES = 8  # the JMVAE has an encoder for each subset
 _MAX_ROBOTS = 64
 
@@ -75,7 +72,6 @@ class Config(Section):
         self._check_viewpoints()
         if self.jmvae.reads_scans and "lidar" in self.modalities:
             self._check_profile()
-        self._check_memory()
 
     def _check_modalities(self) -> None:
         """Modalities must be known; custom sensors must read an attribute, and all be read."""
@@ -209,39 +205,6 @@ class Config(Section):
         expected = f"must be from 3 to {most} to learn from scans: at most 180 degrees"
         require(3 <= lidar.window <= most, lidar, "window", expected)
 
-    def _check_memory(self) -> None:
-        """No array that can become large may exceed a computer's memory.
-
-        Missions need no check: limits of PoIs, robots and viewpoints bound the state of one, and as
-        many play side by side as the memory holds.
-        """
-        sections: list[Section] = [
-            *(self.detector, self.jmvae, self.filter, self.team.tours),
-            *(self.dqn, self.evaluation),
-        ]
-        for section in sections:
-            for fields, number in section.arrays(self._sizes()).items():
-                field = max(fields.split(), key=lambda name: getattr(section, name))
-                expected = (
-                    f"takes {4 * number / 2**30:,.0f} GiB with the other settings; must take at "
-                    f"most {4 * _MAX_NUMBERS / 2**30:.0f} GiB"
-                )
-                require(number <= _MAX_NUMBERS, section, field, expected)
-
-    def _sizes(self) -> Sizes:
-        """Sizes of arrays that follow from several sections."""
-        num_pois, windows = self.arena.num_pois, {"camera": 3 * self.camera.window}
-        windows["lidar"] = max(self.lidar.window, PROFILE if self.jmvae.reads_scans else 1)
-        return Sizes(
-            pois=num_pois,
-            classes=len(self.arena.classes),
-            modalities=len(self.modalities),
-            labels=sum(len(self.labels(name)) for name in self.modalities),
-            window=max(windows.get(name, 1) for name in self.modalities),
-            together=self.jmvae.num_together,
-            state=self._task.most_pois(self) * self._task.features(self),
-        )
-
     @property
     def _task(self) -> "_MapTask | _TeamTask":
         return _TASKS[self.dqn.task]
@@ -305,10 +268,6 @@ class _MapTask:
     def most_pois(self, config: Config) -> int:
         return config.arena.num_pois
 
-    def features(self, config: Config) -> int:
-        """Numbers that a robot observes of each PoI."""
-        return 2 * config.jmvae.latent_size
-
 
 class _TeamTask(_MapTask):
     """What `dqn.task` = team asks of the settings: a team learns from stored detections."""
@@ -323,9 +282,6 @@ class _TeamTask(_MapTask):
 
     def most_pois(self, config: Config) -> int:
         return max(config.team.num_pois[1], config.arena.num_pois)
-
-    def features(self, config: Config) -> int:
-        return super().features(config) + 3 * len(config.modalities) + 4
 
 
 _TASKS = {"map": _MapTask(), "team": _TeamTask()}

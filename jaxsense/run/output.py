@@ -9,7 +9,10 @@ import os
 import sys
 from collections.abc import Callable
 
+import jax
+
 INTERRUPTED = 130  # exit status, as in shells
+_NO_MEMORY = "RESOURCE_EXHAUSTED"
 _RARELY = 100_000, 50, 50  # see `gc.set_threshold`
 
 
@@ -32,6 +35,12 @@ def run(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         complain("Interrupted.")
         status = INTERRUPTED
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, jax.errors.JaxRuntimeError) and _NO_MEMORY not in str(error):
+            raise
+        first, *_ = str(error).splitlines() or [_NO_MEMORY]
+        complain(f"Not enough memory: lower the sizes in the settings ({first})")
+        status = 1
     except SystemExit as stop:
         status = stop.code if isinstance(stop.code, int) else int(stop.code is not None)
         atexit._run_exitfuncs()

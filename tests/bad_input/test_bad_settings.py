@@ -113,7 +113,9 @@ LIMITS = {
     Limits(at_least=1, at_most=60): "navigation.horizon",
     Limits(at_least=1, at_most=64): "arena.num_pois team.num_pois evaluation.num_pois",
     Limits(at_least=1, at_most=8): "team.robots_each",
-    Limits(at_least=1, min_items=1): "detector.hidden jmvae.hidden filter.hidden dqn.hidden",
+    Limits(at_least=1, at_most=65_536, min_items=1): (
+        "detector.hidden jmvae.hidden filter.hidden dqn.hidden"
+    ),
     Limits(at_least=2): "team.tours.tries",
     Limits(min_items=1): "mission.policies",
     Limits(min_items=1, max_items=64): "robots",
@@ -255,8 +257,7 @@ TWINS = {**COLOURS, "crimson": COLOURS["red"]}
 TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5, 1.0))}
 SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
 REDS = "red cylinder", "red cube"
-SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter", "jmvae.looks": 100}
-FROM_SCANS = SCANS | {"jmvae.looks": 4}
+FROM_SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter", "jmvae.looks": 4}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
 OF_SIXTEEN = {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN}
@@ -357,26 +358,7 @@ CHANGES = [
     ({"navigation.view_distances": (0.2,)}, "must be from 0.300 m, where the robot is clear"),
     ({"navigation.view_distances": (1.1,)}, "of the PoI, to navigation.view_range = 1.0 m"),
     ({"detector.hidden": (1.5,)}, "must be a list of whole numbers"),
-    ({"detector.hidden": (10**7, 10**7)}, "detector.hidden = (10000000, 10000000): takes 372,"),
     ({"jmvae.hidden": (2**63,)}, "jmvae.hidden = "),
-    # An encoder for each of 2^3 subsets, of 6 labels, 40,000^2 and 4 parameters of a posterior.
-    (
-        {
-            "modalities": ("camera", "lidar", "x"),
-            "sensors": {"x": SensorConfig("a:b", "shape")},
-            "jmvae.reconstruction_weights": (1.0,) * 3,
-            "jmvae.hidden": (40_000, 40_000),
-        },
-        "jmvae.hidden = (40000, 40000): takes 48 GiB",
-    ),
-    ({"filter.hidden": (10**7, 10**7)}, "filter.hidden = (10000000, 10000000): takes 372,"),
-    ({"filter.batch": 10**9}, "filter.batch = 1000000000: takes"),
-    ({"dqn.hidden": (4096,) * 400}, "dqn.hidden = (4096, 4096"),
-    ({"dqn.batch": 10**8}, "dqn.batch = 100000000: takes"),
-    ({"dqn.num_envs": 10**9, "dqn.replay_capacity": 10**9, "dqn.num_starts": 10**9}, "takes"),
-    ({"detector.num_scans": 2**31 - 1}, "detector.num_scans = 2147483647: takes"),
-    ({"detector.num_held_out": 2**31 - 1}, "detector.num_held_out = 2147483647: takes"),
-    ({"detector.batch": 10**9}, "detector.batch = 1000000000: takes"),
     (
         {"detector.calibration": 0.5, "detector.num_scans": 1, "arena.num_pois": 1},
         "detector.calibration = 0.5: leaves none of 1 scans to train on; lower it",
@@ -406,35 +388,6 @@ CHANGES = [
             "jmvae.reconstruction_weights": (1.0, 1.0, 1.0),
         },
         "jmvae.latent_size = 2: must be at least 3, so that beliefs can hold 8 classes",
-    ),
-    ({"jmvae.samples_per_class": 10**9}, "jmvae.samples_per_class = 1000000000: takes"),
-    ({"jmvae.steps": 10**9}, "jmvae.steps = 1000000000: takes"),
-    ({"jmvae.batch": 10**9}, "jmvae.batch = 1000000000: takes"),
-    # 10^5 PoIs in 300 steps, 2 x 100 looks at each, 2 latents: 1.2 x 10^10 draws.
-    ({**SCANS, "jmvae.batch": 10**5}, "jmvae.batch = 100000: takes 45 GiB"),
-    # 2 x 10^5 PoIs, 100 looks at each, layers of 300: 6 x 10^9 numbers.
-    (
-        {**SCANS, "jmvae.batch": 2 * 10**5, "jmvae.steps": 1, "jmvae.hidden": (300,)},
-        "jmvae.batch = 200000: takes 22 GiB",
-    ),
-    # Encoders and decoders of 2 sensors, from profiles of 64 and wider windows to 3 x 10^7 numbers.
-    ({**SCANS, "jmvae.hidden": (3 * 10**7,)}, "jmvae.hidden = (30000000,): takes"),
-    # 10^5 groups of 100 scenes with 3 PoIs.
-    (
-        {**SCANS, "dqn.observe": "live", "dqn.num_starts": 32 * 10**4},
-        "dqn.num_starts = 320000: takes",
-    ),
-    # Each window of 4 beams becomes 64 numbers, and there are 10^8.
-    (
-        {
-            **SCANS,
-            "modalities": ("lidar",),
-            "jmvae.reconstruction_weights": (1.0,),
-            "lidar.window": 4,
-            "detector.num_scans": 10**8,
-            "arena.classes": ("red cylinder", "red cube"),
-        },
-        "detector.num_scans = 100000000: takes 24 GiB",
     ),
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
     ({"jmvae.reconstruction_weights": (NAN, 1.0)}, "must be a list of numbers, each 0 or"),
@@ -480,26 +433,7 @@ CHANGES = [
     ({"dqn.num_starts": 65}, "dqn.num_starts = 65: must be a multiple of num_envs = 32"),
     ({"dqn.replay_capacity": 65}, "dqn.replay_capacity = 65: must be a multiple of num_envs = 32"),
     ({"dqn.replay_capacity": 32 * 10**8}, "dqn.replay_capacity = 3200000000: must be below 2^31"),
-    # Two states and 3 numbers each; of 3 PoIs with 4 numbers.
-    ({"dqn.replay_capacity": 32 * 10**7}, "dqn.replay_capacity = 320000000: takes 32 GiB"),
-    # Of a team, up to 8 PoIs or those of the arena, with 2 x 2 + 3 x 2 + 4 = 14 numbers.
-    (
-        {"dqn.task": "team", "dqn.replay_capacity": 32 * 10**6},
-        "dqn.replay_capacity = 32000000: takes 27 GiB",
-    ),
-    (
-        {"dqn.task": "team", "arena.num_pois": 16, "dqn.replay_capacity": 32 * 10**6},
-        "dqn.replay_capacity = 32000000: takes 54 GiB",
-    ),
-    ({"dqn.num_starts": 32 * 5 * 10**7}, "dqn.num_starts = 1600000000: takes"),
-    ({"dqn.updates": 10**8}, "dqn.updates = 100000000: takes"),
     ({"dqn.epsilon_start": 0.5, "dqn.epsilon_min": 0.6}, "must be at most epsilon_start = 0.5"),
-    ({"evaluation.num_repeats": 10**8}, "evaluation.num_repeats = 100000000: takes"),
-    ({"evaluation.num_starts": 2**31 - 1}, "evaluation.num_starts = 2147483647: takes"),
-    (
-        {"evaluation.value_points": 10**5, "evaluation.value_looks": 10**4},
-        "evaluation.value_points = 100000: takes 67 GiB",
-    ),
     ({"navigation.view_distances": (0.6, NAN)}, "must be a list of numbers, each 0 or"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
     ({"mission.policies": "naive"}, "mission.policies = 'naive': must be a list of texts"),
@@ -538,23 +472,6 @@ def test_messages_that_no_map_reads_are_named(changes, expected):
     with pytest.raises(ConfigError) as error:
         changed({"mission.communication": CommunicationConfig(**changes)})
     assert str(error.value).startswith(f"mission.communication.{expected}")
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"states": 2 * 10**9}, "team.tours.states = 2000000000: takes"),
-        ({"steps": 10**8}, "team.tours.steps = 100000000: takes"),
-        ({"batch": 10**9}, "team.tours.batch = 1000000000: takes"),
-    ],
-)
-def test_tours_that_cannot_be_learned_are_named(changes, expected):
-    def make():
-        return changed({"team": {"tours": dataclasses.replace(SMOKE.team.tours, **changes)}})
-
-    with pytest.raises(ConfigError) as error:
-        make()
-    assert expected in str(error.value)
 
 
 @pytest.mark.parametrize(("changes", "expected"), CHANGES, ids=count())
