@@ -142,7 +142,7 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
         ({"latent_size": 3}, "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3"),
         ({"classes": 4}, "models.fusion holds 3 classes in 2 dimensions: must be 4 in 2"),
         ({"window": 9}, "models.detectors of lidar: reads windows of 128 numbers; must be of 9"),
-        ({"models": None}, "models = NoneType: must be Models"),
+        ({"models": None}, "models = None: must be Models"),
         ({"looks": 1}, r"looks has 1 entries: must be 2, one for each of \('camera', 'lidar'\)"),
         ({"looks": (3, 0, 2)}, "looks at each class = 0: must be a whole number greater than 0"),
         ({"looks": np.nan}, "looks = nan: must be finite"),

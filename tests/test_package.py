@@ -138,7 +138,7 @@ def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == "False {'cylinder': 0.5, 'cube': 0.5}\n"
     run_example(page, 1, names)
     assert names["scan"].shape == (683,)
-    assert capsys.readouterr().out == "(683,) True\n"
+    assert capsys.readouterr().out == "(683,) True\nFalse\n"
 
 
 def test_example_of_the_settings_runs():

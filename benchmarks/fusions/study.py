@@ -19,7 +19,6 @@ from jaxsense import (
     Models,
     learn,
     make_bayes,
-    make_models,
     mission,
 )
 from jaxsense.config import PresetName
@@ -28,6 +27,7 @@ from jaxsense.dqn import training as dqn
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
 from jaxsense.mission import Mission, MissionState
+from jaxsense.models import make_models
 from jaxsense.run import devices
 from jaxsense.training import fusions, measures
 from jaxsense.training.stage import Outputs, key_of

@@ -220,7 +220,7 @@ def require_type(name: str, value: object, kind: type, source: str) -> None:
 def typed(function: Callable[P, R]) -> Callable[P, R]:
     """Decorator of a public function: arguments must be of the classes that annotate them.
 
-    Checks dataclasses, and members of protocols; raises `ValueError` for another class.
+    Checks dataclasses, members of protocols, and `key`; raises `ValueError` for something else.
     """
     hints: dict[str, type] = {
         n: kind for n, kind in get_type_hints(function).items() if _is_own(kind)
@@ -230,6 +230,8 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> R:
         for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if name == "key":
+                require_key(value)
             if (kind := hints.get(name)) is None:
                 continue
             if dataclasses.is_dataclass(kind):

@@ -9,8 +9,6 @@ import os
 import sys
 from collections.abc import Callable
 
-import jax
-
 INTERRUPTED = 130  # exit status, as in shells
 _NO_MEMORY = "RESOURCE_EXHAUSTED"
 _RARELY = 100_000, 50, 50  # see `gc.set_threshold`
@@ -35,8 +33,8 @@ def run(main: Callable[[], None]) -> None:
     except KeyboardInterrupt:
         complain("Interrupted.")
         status = INTERRUPTED
-    except (MemoryError, jax.errors.JaxRuntimeError) as error:
-        if isinstance(error, jax.errors.JaxRuntimeError) and _NO_MEMORY not in str(error):
+    except (MemoryError, RuntimeError) as error:  # JAX's errors are of the second kind
+        if not isinstance(error, MemoryError) and _NO_MEMORY not in str(error):
             raise
         first, *_ = str(error).splitlines() or [_NO_MEMORY]
         complain(f"Not enough memory: lower the sizes in the settings ({first})")

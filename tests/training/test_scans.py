@@ -160,17 +160,6 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
 
 
-def test_the_check_of_memory_knows_the_largest_frame():
-    lidar = dataclasses.replace(TINY.lidar, window=4)
-    alone = dataclasses.replace(
-        TINY, modalities=("lidar",), robots=None, lidar=lidar,
-        arena=dataclasses.replace(TINY.arena, classes=("red cylinder", "red cube")),
-        jmvae=dataclasses.replace(TINY.jmvae, reconstruction_weights=(1.0,)),
-    )  # fmt: skip
-    for config in (TINY, alone):
-        assert max(make_shape(config).inputs) == config._sizes().window
-
-
 def test_a_jmvae_of_scans_needs_a_filter():
     with pytest.raises(ConfigError, match=r"jmvae.fusion = 'in_place'.*must be filter"):
         JmvaeConfig(learns_from="scans")
