@@ -1,6 +1,5 @@
 """What every row is measured with: compile time apart, both sides in turn, medians."""
 
-import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
@@ -220,7 +219,7 @@ def compiled(
     """
     if workers.mesh is not None:
         share = devices.part(shapes_of(args), 0, workers.shares)
-        alone = trace(function, share, lambda _: contextlib.nullcontext())
+        alone = trace(function, share)
         function = devices.spread(alone.__call__, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     # A single worker also takes what has no rows, such as a key.
