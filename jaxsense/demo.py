@@ -35,8 +35,8 @@ class Arguments:
     preset: str = "default"
     """Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or `team`."""
     policy: str = "latent"
-    """Policy to compare with naive exploration: `latent` (the learned policy), `greedy`, `bayes`,
-    `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
+    """Policy to compare with naive exploration: `latent` (the learned policy), `network`, `greedy`,
+    `bayes`, `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
     seed: int = 2
     """Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,
     robots can skip looks; in those of 0 and 1, they cannot."""
@@ -131,20 +131,19 @@ def _page(
         films=[html.films({name: film(name) for name in played})],
         averages=_AVERAGES,
         table=table,
-        sentence=_sentence(arguments.policy, len(scenario.config.carried)),
+        sentence=_sentence(arguments.policy),
     )
 
 
-def _sentence(policy: str, robots: int) -> str:
+def _sentence(policy: str) -> str:
     """What the animations show."""
-    naive = f"under naive exploration, each of the {robots} robots looks at every PoI (point of "
-    naive += "interest) once"
+    naive = "under naive exploration, every PoI (point of interest) gets one look with each sensor"
     if policy == _REFERENCE:
         return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
-    learned = "the learned policy (latent) takes the look that is worth most on the shared map"
-    chooses = {"latent": learned}
-    how = chooses.get(policy, f"the policy {policy} chooses each look")
-    return f"In the first animation, {how}, and stops when no look pays; {naive}."
+    how = f"the policy {policy} chooses each look"
+    if policy == "latent":
+        how = "robots take looks that the learned policy (latent) calls useful on the shared map"
+    return f"In the first animation, {how}, until no look pays; {naive}."
 
 
 def _has_display() -> bool:

@@ -57,10 +57,11 @@ class Arguments:
     seed: int = 0
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """What to play: `latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`,
-    `random`, `nearest`, `auction` or `rollout`; `policies` for all of these; `ROBOT_alone`,
-    `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in missions
-    where that robot works alone, or stops or goes blind after 6 s; or `all` for everything."""
+    """What to play: `latent`, `network`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
+    `naive_3`, `random`, `nearest`, `auction` or `rollout`; `policies` for all of these;
+    `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in
+    missions where that robot works alone, or stops or goes blind after 6 s; or `all` for
+    everything."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
     """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by

@@ -227,7 +227,7 @@ def test_evaluate_prints_the_comparison(evaluated):
         "right",
         "against",
         "control steps/s",
-        "11 missions",  # one of each policy
+        "12 missions",  # one of each policy
     ):
         assert words in printed
 
@@ -333,7 +333,10 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--policy", "best"], "policy = 'best': must be one of all, policies, latent, greedy"),
+        (
+            ["--policy", "best"],
+            "policy = 'best': must be one of all, policies, latent, network, greedy",
+        ),
         (["--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
         (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
         (["--episode", "3"], "unknown option --episode; did you mean --episodes?"),

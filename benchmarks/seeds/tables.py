@@ -146,16 +146,17 @@ def of_missions(found: Mapping[str, Any], preset: str) -> str:
 
 
 _POLICIES = {
-    "latent": "the learned policy",
+    "latent": "looks that pay by the Q-network, ordered by an auction (`team`: a learned order)",
+    "network": "highest value of the Q-network (`team`: as `latent`)",
     "greedy": "highest expected gain on the map",
     "bayes": "highest expected gain by exact Bayes",
     "optimal": "dynamic programming",
     "auction": "rule: an auction of PoIs",
     "nearest": "rule: the nearest PoI worth a look",
     "rollout": "rule: the highest gain per second",
-    "naive": "one look by each robot",
-    "naive_2": "two looks by each robot",
-    "naive_3": "three looks by each robot",
+    "naive": "one look with each sensor",
+    "naive_2": "two looks with each sensor",
+    "naive_3": "three looks with each sensor",
     "random": "any PoI",
 }
 _OF_MISSIONS = (
@@ -187,7 +188,7 @@ SIZES: Mapping[Played, str] = {
 
 
 def worth(found: Mapping[str, Any], names: Mapping[Played, str]) -> str:
-    """What every policy reaches: time, as a multiple of the learned one's; looks; and wrong PoIs.
+    """What every policy reaches: time, as a multiple of `latent`'s; looks; and wrong PoIs.
 
     Args:
       found: from `gather`.

@@ -103,9 +103,9 @@ class MissionConfig(Section, place="mission"):
     """Missions, in which all robots act in closed loop in one arena."""
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
-    """Policies that play missions at the end of a run: any of `latent`, `greedy`, `bayes`,
-    `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and custom
-    policies. `jaxsense.evaluate` plays all of them."""
+    """Policies that play missions at the end of a run: any of `latent`, `network`, `greedy`,
+    `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and
+    custom policies. `jaxsense.evaluate` plays all of them."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)

@@ -257,7 +257,7 @@ def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
 
 
 def naive(number: int) -> Values:
-    """Explores naively: every robot looks at every PoI `number` times."""
+    """Explores naively: every PoI gets `number` looks with each sensor, by any of its robots."""
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         del key, models
@@ -303,12 +303,14 @@ def _own_network(models: Trained, known: Known) -> Params:
 
 
 def _always(agent: Agent) -> bool:
+    """Says that a policy's highest value is its choice, which no rule of missions changes."""
     del agent
     return True
 
 
 POLICIES: dict[str, Policy] = {
     "latent": Policy(latent, lambda agent: agent.counts_time, True, latent_worth),
+    "network": Policy(latent, _always),
     "greedy": Policy(greedy, is_unordered=True),
     "bayes": Policy(bayes, is_unordered=True),
     "optimal": Policy(optimal, is_unordered=True),

@@ -1,4 +1,7 @@
-"""The choice of the PoI that a robot looks at next: its policy's values, and the rules of missions.
+"""The choice of the PoI that a robot looks at next.
+
+With `mission.auctions`, a policy says which looks pay, and an auction over travel times divides
+them among the robots. Without, and where values include travel time, the highest value decides.
 
 It reads nothing but what a robot knows, so that `python -m jaxsense.export` takes it along.
 """

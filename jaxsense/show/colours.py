@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from jaxsense.config import ArenaConfig
 
 RGB = tuple[float, float, float]
-MARKERS = "oDs^vPX<>pd"
+MARKERS = "oDs^vPX<>pdh"
 SOFT = "#59616e"
 """Colour of what matters less."""
 
@@ -21,7 +21,7 @@ _POLICY_COLOURS = {
     "nearest": ("#cd79aa", "#cc69a4"), "auction": ("#d00dd4", "#d93fff"),
     "rollout": ("#b79710", "#b7960a"), "naive": ("#523a05", "#917b4f"),
     "naive_2": ("#05475b", "#47def1"), "naive_3": ("#d00e4d", "#ff8bb5"),
-    "random": ("#1711c8", "#af9aff"),
+    "random": ("#1711c8", "#af9aff"), "network": ("#0c0054", "#f0d800"),
 }  # fmt: skip
 _OTHER_POLICY = ("#0fb851", "#0cc75f"), "*"  # a custom one
 ON_DARK = dict([*_POLICY_COLOURS.values(), _OTHER_POLICY[0]])

@@ -45,6 +45,7 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.named_code else "",
         summary=summary,
+        order=_order(config),
         remarks=compare.remarks(summary),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],
@@ -62,6 +63,15 @@ def render(
         plot=lambda name: _data(run / f"{name}.svg"),
         films=_films(run),
     )
+
+
+def _order(config: Config) -> str:
+    """Who takes which look under the latent policy, see `mission.choice`."""
+    if config.dqn.task == "team" and config.team.tours.steps:
+        return "a second network orders these looks"
+    if config.mission.auctions:
+        return "an auction over travel times divides these looks among the robots"
+    return "robots take the most valuable look first"
 
 
 def _films(run: Path) -> list[html.Films]:

@@ -196,7 +196,10 @@ TRAIN = [
     (["--num_seed=3"], "unknown option --num-seed; did you mean --num-seeds?"),
     (["--dqn.epoch", "3"], "unknown option --dqn.epoch; did you mean --dqn.epochs?"),
     (["--" + "x" * 5000], "unknown option --xxx"),
-    (["--mission.policies", "naive", "best"], "('naive', 'best'): must be among latent, greedy"),
+    (
+        ["--mission.policies", "naive", "best"],
+        "('naive', 'best'): must be among latent, network, greedy",
+    ),
     (["smoke"], "unexpected argument 'smoke'"),
 ]
 

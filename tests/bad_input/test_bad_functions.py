@@ -844,7 +844,7 @@ def test_functions_refuse(given_world, name):
 @pytest.mark.parametrize(
     ("inputs", "expected"),
     [
-        ({"policy": 11}, "policy = 11: must be a whole number from 0 to 10"),
+        ({"policy": 12}, "policy = 12: must be a whole number from 0 to 11"),
         ({"policy": -1}, "policy = -1"),
         ({"classes": BAD}, "classes = 7"),
         ({"faults": mission.Faults(jnp.full(2, NAN), jnp.zeros(2))}, "faults.stops_at = nan"),

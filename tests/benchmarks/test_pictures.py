@@ -101,5 +101,5 @@ def test_a_film_names_the_policies_that_it_can_play(tmp_path, capsys):
         film.main(["pretrained:default", "--policy", "best", "--plot", str(tmp_path / "film.svg")])
     assert stop.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("benchmarks.film: policy = 'best': must be one of latent, greedy,")
+    assert line.startswith("benchmarks.film: policy = 'best': must be one of latent, network,")
     assert not (tmp_path / "film.svg").exists()

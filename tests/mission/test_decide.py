@@ -74,6 +74,16 @@ def test_in_an_auction_a_robot_takes_what_is_near_of_all_that_pays(chosen, value
     assert state.robots.phase[0] == (ENDED if target == 3 else DRIVING)
 
 
+@pytest.mark.parametrize(
+    ("values", "target"),
+    # The second value is within `equal_values` = 0.1 of the first, whose PoI is nearer.
+    [([0.1, 5.0, 0.2, 0.0], 1), ([1.0, 1.05, 0.2, 0.0], 1), ([0.5, 0.5, 0.5, 0.6], 3)],
+)
+def test_the_network_alone_takes_its_highest_value(chosen, values, target):
+    state = chosen(values, POLICIES.index("network"), auctions=True)
+    assert state.robots.target[0] == target
+
+
 def test_in_an_auction_another_robot_takes_what_is_nearer_to_it(chosen, set_robot):
     # The other robot stands on PoI 0's far side, turned towards it.
     there = jnp.array([[0.0, 0.0, 0.0], [1.5, 0.0, jnp.pi]])

@@ -109,7 +109,7 @@ def test_every_policy_of_the_table_is_played(own, decides, models, arena_of):
 
 def test_an_unknown_policy_is_refused(own):
     with pytest.raises(
-        ConfigError, match=r"^policy = 'best': must be one of latent, gre.*, timed$"
+        ConfigError, match=r"^policy = 'best': must be one of latent, network, gre.*, timed$"
     ):
         own.policy("best")
 
@@ -150,7 +150,7 @@ def test_a_policy_may_not_be_named_like_a_fault():
     [
         ("bytes_per_detection", "must not be all, policies, bytes_per_detection"),
         ("all", "must not be all, policies, bytes_per_detection"),
-        ("latent", "must not be latent, greedy, "),
+        ("latent", "must not be latent, network, greedy, "),
         ("a/b", "must be a word of 1 to 64 letters"),
         (" ", "must be a word of 1 to 64 letters"),
         ("", "must be a word of 1 to 64 letters"),
@@ -192,7 +192,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
 def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
     with pytest.raises(SystemExit):
         train.main([*RUN, "--out", str(tmp_path / "run"), "--cache", "None"])
-    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must be among latent, greedy"
+    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must be among latent, network"
     assert capsys.readouterr().err.startswith(line)
     assert not (tmp_path / "run").exists()
 
