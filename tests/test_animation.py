@@ -118,6 +118,27 @@ def test_each_animation_ends_as_its_element_is():
             )
 
 
+@pytest.mark.parametrize("jumps", [False, True])
+def test_an_element_holds_what_the_last_frame_shows(jumps):
+    timeline = Timeline(np.array([0.0, 0.25, 0.5]), ElementTree.Element("style"))
+    element = ElementTree.Element("g")
+    timeline.animate(element, "cx", [1.0, 4.0, 6.0], jumps=jumps)
+    timeline.animate(element, "rotate", [10.0, 40.0, 60.0], jumps=jumps)
+    assert (element.get("cx"), element.get("transform")) == ("6", "rotate(60)")
+
+
+def test_pois_are_drawn_in_their_size(picture):
+    # Radius 0.1 m at 340 px for 3 m is 11.33 px; the half sides of both shapes are whole radii.
+    circles = [
+        e
+        for e in picture.iter(f"{SVG}circle")
+        if e.get("fill") in ("#1ab21a", "#cc1a1a") and not e.get("cx")
+    ]
+    boxes = [e for e in picture.iter(f"{SVG}rect") if "rotate" in e.get("transform", "")]
+    assert [e.get("r") for e in circles] == ["11.33", "11.33"]
+    assert [(e.get("x"), e.get("width")) for e in boxes] == [("-11.33", "22.67")]
+
+
 def test_what_moves_in_straight_lines_is_told_by_their_ends():
     moments = np.arange(101) / 125
     sheet, element = ElementTree.Element("style"), ElementTree.Element("g")

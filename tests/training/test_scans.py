@@ -281,6 +281,7 @@ def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
 
     def repeat(keys, world, classes, modality, number, places):
         given[modality] = classes, places
+        assert number == 4  # looks in a scene
         return jnp.zeros((30, number, 2)), jnp.zeros((30, number, 2))
 
     def fit(found, positions, classes):

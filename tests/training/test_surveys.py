@@ -110,6 +110,31 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
 
 
+@pytest.mark.parametrize(
+    ("num_pois", "num_scans", "observe", "together", "expected"),
+    [
+        # 171 scans of 3 PoIs are 57 scenes, with an empty one for each 8; the bank needs 10 looks
+        # at each of 3 classes, and 25 held-out looks are 9 at each class.
+        (3, 171, "bank", 1, (57, 10, 9, 8)),
+        (3, 168, "bank", 1, (56, 10, 9, 7)),
+        (3, 31, "live", 1, (11, 64, 9, 2)),
+        (4, 31, "bank", 1, (8, 8, 7, 1)),
+        # In groups of 4 scenes that show the same PoIs.
+        (3, 31, "live", 4, (12, 256, 12, 2)),
+    ],
+)
+def test_numbers_of_scenes(num_pois, num_scans, observe, together, expected):
+    learning = {"learns_from": "scans", "fusion": "filter"} if together > 1 else {}
+    config = dataclasses.replace(
+        MEASURED,
+        arena=dataclasses.replace(MEASURED.arena, num_pois=num_pois),
+        detector=dataclasses.replace(MEASURED.detector, num_scans=num_scans),
+        jmvae=JmvaeConfig(samples_per_class=10, looks=4, **learning),
+        dqn=dataclasses.replace(MEASURED.dqn, observe=observe),
+    )
+    assert num_scenes(config) == expected
+
+
 @pytest.mark.slow
 def test_a_scene_is_the_same_whoever_works_it_out():
     listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
