@@ -28,12 +28,13 @@ def multiplying(models: jaxsense.Models) -> jaxsense.Models:
 
 if __name__ == "__main__":
     config, trained = jaxsense.load_pretrained("default")  # or `jaxsense.load("runs/...")`
-    key, models = jax.random.key(0), multiplying(trained)
+    models, scenario = multiplying(trained), mission.make_mission(config)
+    start_key, reset_key, play_key, *keys = jax.random.split(jax.random.key(0), 6)
     mdp, step = jaxsense.make_mdp(config, models), jax.jit(dqn.step)
-    state = dqn.reset(key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
-    for look in range(3):
-        state, outcome = step(jax.random.key(look), mdp, state, jnp.int32(0), jnp.int32(look % 2))
+    state = dqn.reset(start_key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
+    for look, key in enumerate(keys):
+        state, outcome = step(key, mdp, state, jnp.int32(0), jnp.int32(look % 2))
         print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
-    scenario = mission.make_mission(config)
-    play = jax.jit(lambda k, m: mission.rollout(k, scenario, m, mission.reset(k, scenario, m), 150))
-    print(f"looks in a mission:\n{play(key, models)[0].times_seen}")
+    reset = jax.jit(lambda key: mission.reset(key, scenario, models))
+    play = jax.jit(lambda key, state: mission.rollout(key, scenario, models, state, 150)[0])
+    print(f"looks in a mission:\n{play(play_key, reset(reset_key)).times_seen}")

@@ -17,13 +17,15 @@ def widest(key: jax.Array, models: policies.Trained, known: dqn.Known) -> jax.Ar
 
 if __name__ == "__main__":
     config, models = jaxsense.load_pretrained("noisy")  # or those of `jaxsense.load("runs/...")`
-    key, mdp = jax.random.key(0), jaxsense.make_mdp(config, models)
+    start_key, play_key = jax.random.split(jax.random.key(0))
+    mdp = jaxsense.make_mdp(config, models)
 
     def act(key: jax.Array, known: dqn.Known) -> jax.Array:
         """The action in the map MDP."""
         return policies.best(widest(key, models, known))
 
-    start = episodes.reset(key, mdp, models.bayes)
-    total, first = jax.jit(lambda: episodes.run_episode(key, mdp, models.bayes, act, start, 0))()
+    start = episodes.reset(start_key, mdp, models.bayes)
+    play = jax.jit(lambda key: episodes.run_episode(key, mdp, models.bayes, act, start, 0))
+    total, first = play(play_key)
     print(f"map MDP: total reward {total:.2f}, of the first look {first:.2f}")
     print(jaxsense.score_missions(config, models, {"widest": widest}, episodes=64))

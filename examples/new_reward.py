@@ -28,11 +28,12 @@ class Confident:
 
 if __name__ == "__main__":
     config, models = jaxsense.load_pretrained("default")  # or those of `jaxsense.load("runs/...")`
-    key, settings = jax.random.key(0), jaxsense.PRESETS["smoke"].dqn  # a short training
-    looks = jaxsense.Bank(jaxsense.detections(key, config, models, samples=64))
+    look_key, train_key = jax.random.split(jax.random.key(0))
+    settings = jaxsense.PRESETS["smoke"].dqn  # a short training
+    looks = jaxsense.Bank(jaxsense.detections(look_key, config, models, samples=64))
     mdp, reward = jaxsense.make_mdp(config, models, looks), Confident(config.mdp)
     learning = models.agent.environment(dataclasses.replace(mdp, reward=reward), modality=0)
     settings = dataclasses.replace(settings, target_period=5, epsilon_decay=0.9)
-    state, info = jax.jit(lambda key: dqn.train(key, learning, settings))(key)
+    state, info = jax.jit(lambda key: dqn.train(key, learning, settings))(train_key)
     for name, part in (("first", slice(1, 16)), ("last", slice(-15, None))):
         print(f"episode return in the {name} 15 epochs: {info.episode_return[part].mean():.3f}")

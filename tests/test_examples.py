@@ -320,7 +320,8 @@ def test_the_widest_belief_is_looked_at_twice_at_most(example):
 
 @pytest.mark.slow  # compiles a training
 def test_new_reward(capsys):
-    told = printed("new_reward", capsys)
+    with jax.debug_key_reuse(True):
+        told = printed("new_reward", capsys)
     first, last = map(float, re.findall(r"-?\d+\.\d{3}", told))
     # It learns to look while looks add more than they cost, at most from 1/3 to 1 at each PoI.
     assert first + 0.1 < last < 3 * (1 - 1 / 3)

@@ -176,9 +176,11 @@ def _corners(weights: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
     )
     rank = jnp.sum(ahead, axis=1)
     ordered = jnp.sum(jnp.where(rank[None] == axes[:, None], rest[None], 0.0), axis=1)
-    falling = jnp.concatenate([jnp.ones(1), ordered, jnp.zeros(1)])
+    falling = jnp.pad(ordered, 1, constant_values=(1, 0))
     walk = rank[None, :] < jnp.arange(len(weights))[:, None]
-    return _rows(base.astype(jnp.int32)[None, :] + walk, steps), falling[:-1] - falling[1:]
+    return _rows(base.astype(jnp.int32)[None, :] + walk.astype(jnp.int32), steps), falling[
+        :-1
+    ] - falling[1:]
 
 
 def value_iteration(
@@ -221,10 +223,10 @@ def value_iteration(
     checks.require_shape("likelihoods", likelihoods, (number, num_looks, number))
     checks.require_finite("likelihoods", likelihoods)
     checks.require_number("horizon", horizon)
-    points = jnp.asarray(lattice(number, max_points), jnp.float32)
+    points = jnp.asarray(lattice(number, max_points), likelihoods.dtype)
     steps = steps_of_lattice(number, len(points))
     # The unseen PoI is the last row, to which no look leads.
-    start = jnp.full(number, 1 / number) if start is None else start
+    start = jnp.full(number, 1 / number, points.dtype) if start is None else start
     checks.require_shape("start", start, (number,))
     checks.require_probabilities("start", start)
     points = jnp.concatenate([points, start[None]])

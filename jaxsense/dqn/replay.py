@@ -87,9 +87,9 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
     rounds, blocks, rows, width = replay.columns.shape
     filled = jnp.minimum(replay.count, rounds)
     size = draws.shape[0]
-    row = (draws[:, 0] * filled).astype(jnp.int32)
+    row = (draws[:, 0] * filled.astype(draws.dtype)).astype(jnp.int32)
     # Rounding may lift a sum, though not a product, to the end of its range.
-    share = (jnp.arange(size) + draws[:, 1]) * (blocks / size)
+    share = (jnp.arange(size, dtype=draws.dtype) + draws[:, 1]) * (blocks / size)
     block = jnp.minimum(share.astype(jnp.int32), blocks - 1)
     drawn = replay.columns[row, block]
     columns = jnp.moveaxis(drawn, 0, 1).reshape(rows, size * width)

@@ -56,8 +56,8 @@ class EpochInfo:
       loss: `[]` mean over the gradient steps.
       episode_return: `[]` mean total reward of the exploring policy's episodes that ended.
       episodes: `[]` int32 episodes that ended.
-      evaluation_return: `[]` mean total reward of the learned policy after the epoch; NaN except
-        after the last epoch of a chunk, see `train_chunk`.
+      evaluation_return: `[]` mean total reward of the learned policy after the epoch; NaN in epochs
+        without an evaluation, see `train_chunk`; None if there is none.
       epsilon: `[]` chance of a random action.
       is_finite: `[]` bool, whether values, rewards, loss and new parameters are finite.
     """
@@ -65,7 +65,7 @@ class EpochInfo:
     loss: jax.Array
     episode_return: jax.Array
     episodes: jax.Array
-    evaluation_return: jax.Array
+    evaluation_return: jax.Array | None
     epsilon: jax.Array
     is_finite: jax.Array
 
@@ -187,7 +187,7 @@ def train_chunk(
     def advance(state: DqnState[S], of_group: tuple[Key, _Draws]) -> tuple[DqnState[S], EpochInfo]:
         key, draws = of_group
         state, infos = jax.lax.scan(epoch, state, draws)
-        found = infos.evaluation_return.at[-1].set(evaluate(key, state.params))
+        found = jnp.full(every, jnp.nan).at[-1].set(evaluate(key, state.params))
         return state, dataclasses.replace(infos, evaluation_return=found)
 
     # `_draw` splits the key itself in three, as without evaluation.
@@ -241,7 +241,7 @@ def _epoch(
         loss=loss,
         episode_return=ended_reward / jnp.maximum(episodes, 1),
         episodes=episodes,
-        evaluation_return=jnp.float32(jnp.nan),
+        evaluation_return=None,
         epsilon=epsilon,
         is_finite=is_finite,
     )
