@@ -216,7 +216,7 @@ def run_team(
         reward = outcome.reward - mdp.time_price(after.team, seconds)
         return _TeamCarry(
             state=after,
-            looks=carry.looks.at[target, own].add(seconds > 0, mode="drop"),
+            looks=carry.looks.at[target, own].add((seconds > 0).astype(jnp.int32), mode="drop"),
             memory=memory,
             done=outcome.terminated | outcome.truncated,
             total=carry.total + reward,

@@ -41,7 +41,7 @@ class Places:
         side = self.sides[0] + (self.sides[1] - self.sides[0]) * draws[0]
         order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
         cell = jnp.argsort(order)[:num_pois]
-        corner = jnp.stack([cell // per_side, cell % per_side], axis=-1)
+        corner = jnp.stack([cell // per_side, cell % per_side], axis=-1).astype(side.dtype)
         play = jnp.maximum(side / per_side - self.poi_pitch, 0.0)
         jitter = play * (draws[: 2 * num_pois].reshape(num_pois, 2) - 0.5)
         positions = (corner + 0.5) * side / per_side - side / 2 + jitter

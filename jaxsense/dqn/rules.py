@@ -29,7 +29,7 @@ def nearest(
       team: robots and PoIs at this moment; PoIs that other robots head for come last.
       agent: `[]` int32, the robot that chooses.
     """
-    cost = times[agent] + _TAKEN * _is_taken(team, agent)
+    cost = times[agent] + jnp.where(_is_taken(team, agent), _TAKEN, 0.0)
     return _with_nop(1 / (1 + cost), _is_useful(gains, team)[agent])
 
 
@@ -76,7 +76,7 @@ def gain_rate(
       team: see `nearest`.
       agent: see `nearest`.
     """
-    rate = gains[agent] / (times[agent] + _TAKEN * _is_taken(team, agent))
+    rate = gains[agent] / (times[agent] + jnp.where(_is_taken(team, agent), _TAKEN, 0.0))
     return _with_nop(rate, _is_useful(gains, team)[agent])
 
 

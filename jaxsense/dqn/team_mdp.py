@@ -117,7 +117,7 @@ class TeamMdp:
           team: after the time has passed.
           seconds: `[]` that passed.
         """
-        return self.config.second_cost * seconds * jnp.sum(team.works)
+        return self.config.second_cost * seconds * jnp.sum(team.works, dtype=seconds.dtype)
 
 
 def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
@@ -193,8 +193,8 @@ def observation(
         (times[agent] / TIME_SCALE)[None],
         heading,
         nearest,
-        own,
-        team.present[None],
+        own.astype(times.dtype),
+        team.present[None].astype(times.dtype),
         relative.T,
     ]
     return jnp.where(team.present[None], jnp.concatenate(rows, axis=0), 0.0)

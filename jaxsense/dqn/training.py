@@ -219,9 +219,8 @@ def _epoch(
     draws: _Draws,
 ) -> tuple[DqnState[S], EpochInfo]:
     """One step of each environment and `config.updates` gradient steps."""
-    epsilon = jnp.maximum(
-        config.epsilon_min, config.epsilon_start * config.epsilon_decay**state.epoch
-    )
+    decay = jax.lax.pow(jnp.asarray(config.epsilon_decay, jnp.float32), state.epoch)
+    epsilon = jnp.maximum(config.epsilon_min, config.epsilon_start * decay)
     started = _restart(draws.start, state.envs, shares, state.done)
     envs, has_ended, transitions, values = _explore(
         environment, config, state.params, started, epsilon, draws
@@ -289,7 +288,7 @@ def _explore(
 def _explored(environment: Environment[S], states: S, draws: jax.Array) -> jax.Array:
     """Random `[E]` int32 actions that exist in `[E]` states, from `[E]` draws in [0, 1)."""
     exist = jax.vmap(environment.action_mask)(states)
-    number = jnp.floor(draws * jnp.sum(exist, axis=1)).astype(jnp.int32)
+    number = jnp.floor(draws * jnp.sum(exist, axis=1, dtype=draws.dtype)).astype(jnp.int32)
     return jnp.argmax(jnp.cumsum(exist, axis=1) > number[:, None], axis=1).astype(jnp.int32)
 
 

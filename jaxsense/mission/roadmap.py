@@ -88,7 +88,7 @@ def build(config: Config, layout: Layout) -> Roadmap:
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
     arena, settings = config.arena, config.navigation
     radius = _radius(config)
-    sides = 2 * jnp.pi * jnp.arange(NODES_PER_POI) / NODES_PER_POI
+    sides = 2 * jnp.pi * jnp.arange(float(NODES_PER_POI)) / NODES_PER_POI
     # So far out that the paths between neighbours do not cut the circle.
     ring = (radius + _LEEWAY) / math.cos(math.pi / NODES_PER_POI)
     around = ring * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
@@ -220,7 +220,7 @@ def _radius(config: Config) -> float:
 def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], Bool[Array, "N V"]]:
     """Positions around each PoI, and whether they are free and see it."""
     settings, num_pois = config.navigation, config.arena.num_pois
-    sides = 2 * jnp.pi * jnp.arange(VIEW_SIDES) / VIEW_SIDES
+    sides = 2 * jnp.pi * jnp.arange(float(VIEW_SIDES)) / VIEW_SIDES
     distances = jnp.array(settings.view_distances)
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)

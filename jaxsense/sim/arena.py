@@ -257,11 +257,13 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     draws = jax.random.uniform(key, (per_side**2 + 3 * config.num_pois,))
     cell = jnp.argsort(draws[: per_side**2])[: config.num_pois]
     x, y, turn = draws[per_side**2 :].reshape(3, config.num_pois)
-    corner = jnp.stack([cell // per_side, cell % per_side], axis=-1) * cell_side - config.side / 2
+    corner = jnp.stack([cell // per_side, cell % per_side], axis=-1).astype(draws.dtype)
     play = (cell_side - config.poi_pitch) / 2
     offset = play * (2 * jnp.stack([x, y], axis=-1) - 1)
     yaw = jnp.pi * (2 * turn - 1)
-    return make_layout(config, corner + cell_side / 2 + offset, yaw, classes)
+    return make_layout(
+        config, corner * cell_side - config.side / 2 + cell_side / 2 + offset, yaw, classes
+    )
 
 
 @checks.typed

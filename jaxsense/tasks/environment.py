@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxsense.config import require_32_bits
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_agent import observation
@@ -106,6 +107,9 @@ class Environment(Protocol):
 
         Returns:
           `[S]` observation, and the state.
+
+        Raises:
+          ConfigError: if JAX computes in 64 bits.
         """
         ...
 
@@ -165,6 +169,7 @@ class OneAgent:
 
     def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
         """Starts an episode, see `Environment.reset`."""
+        require_32_bits()
         state = map_mdp.reset(key, self.mdp)
         return self.observe(state), state
 

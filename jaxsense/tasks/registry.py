@@ -115,8 +115,10 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
       agent: see `make`; only with a name.
 
     Raises:
-      ConfigError: if there is no such task or agent, or if `task` is something else.
+      ConfigError: if there is no such task or agent, if `task` is something else, or if JAX
+        computes in 64 bits.
     """
+    require_32_bits()
     if isinstance(task, str) and task in TASKS:
         return make(task, agent)
     if isinstance(task, type | str) or not hasattr(task, "play"):

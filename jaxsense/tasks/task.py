@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxsense.config import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import environments, episodes, map_agent, policies, team_mdp
@@ -303,6 +304,7 @@ class TeamTask:
 
     def reset(self, key: Key) -> tuple[Float[Array, " S"], TeamState]:
         """Starts an episode, see `Task.reset`."""
+        require_32_bits()
         state = team_mdp.reset(key, self.mdp, self.robots)
         return self.observe(state), state
 

@@ -1,0 +1,104 @@
+"""What settings of JAX change: 64 bits, strict promotion, and errors where a NaN appears."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsense
+from jaxsense import Transition, dqn, sim
+from jaxsense.config import ConfigError, MdpConfig
+from jaxsense.core.types import Belief
+from jaxsense.dqn import replay
+from jaxsense.mission import roadmap
+
+KEY = jax.random.key(0)
+CONFIG = jaxsense.PRESETS["default"]
+
+
+def step(name):
+    task = jaxsense.make(name)
+    _, state = task.reset(KEY)
+    return task.step(KEY, state, jnp.int32(1))
+
+
+def play(name):
+    task = jaxsense.make(name)
+    task.play_reference(KEY, "naive")
+    return task.play(KEY, lambda key, memory, seen: (jax.random.randint(key, (), 0, 4), ()), ())
+
+
+def paths():
+    layout = sim.random_layout(KEY, CONFIG.arena, jnp.array([0, 1, 2]))
+    return roadmap.lengths(CONFIG, layout, roadmap.build(CONFIG, layout), jnp.zeros(2), 1)
+
+
+def values(dtype=jnp.float32):
+    """Of looks at two classes that are right four times out of five."""
+    right, wrong = np.log(0.8), np.log(0.2)
+    looks = np.full((2, 5, 2), wrong)
+    looks[0, :4, 0] = looks[1, :4, 1] = looks[0, 4, 1] = looks[1, 4, 0] = right
+    prior = Belief(jnp.zeros(1), jnp.ones(1))
+    return dqn.value_iteration(
+        jnp.asarray(looks, dtype), dqn.Nats(0.1), lambda p: prior, prior, MdpConfig(), 8
+    )
+
+
+def remember():
+    states, scalars = jnp.ones((3, 8)), jnp.zeros(8)
+    seen = Transition(states, scalars.astype(jnp.int32), scalars, scalars, states)
+    memory = replay.add(replay.init(3, 5, 2, 4), seen)
+    return replay.sample(jnp.zeros((2, 2)), memory)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda: step("map-v0"),
+        lambda: step("team-v0"),
+        lambda: play("map-v0"),
+        lambda: play("team-v0"),
+        paths,
+        values,
+        remember,
+    ],
+)
+def test_functions_trace_with_strict_promotion(function):
+    with jax.numpy_dtype_promotion("strict"):
+        jax.eval_shape(function)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_values_of_looks_have_the_dtype_of_the_likelihoods(dtype):
+    expected = values()
+    with jax.enable_x64(True):
+        found = values(dtype)
+        assert {x.dtype for x in jax.tree.leaves(found)} == {jnp.dtype(dtype)}
+        # One look at even odds: ln 2 - H(.8) - .1 nats.
+        first = np.log(2) + 0.8 * np.log(0.8) + 0.2 * np.log(0.2) - 0.1
+        np.testing.assert_allclose(found.one_step_unseen, first, rtol=1e-6)
+        np.testing.assert_allclose(found.q, np.asarray(expected.q), atol=1e-5)
+
+
+def nop(key, observation):
+    return jnp.int32(3)
+
+
+@pytest.mark.parametrize("name", ["map-v0", "team-v0"])
+def test_a_task_refuses_64_bits_that_are_switched_on_later(name):
+    task = jaxsense.make(name)
+    with jax.enable_x64(True):
+        for use in (task.reset, lambda key: jaxsense.tasks.mean_return(key, task, None, 2)):
+            with pytest.raises(ConfigError, match="JAX_ENABLE_X64 = True: must be off"):
+                use(KEY)
+
+
+def test_q_learning_raises_no_error_about_nan():
+    task, settings = jaxsense.make("map-v0"), jaxsense.PRESETS["smoke"].dqn
+    settings = dataclasses.replace(settings, epochs=settings.chunk)
+    learning = task.learning(task.models.agent)
+    with jax.debug_nans(True):
+        _, info = jax.jit(lambda key: dqn.train(key, learning, settings))(KEY)
+    assert info.evaluation_return is None
