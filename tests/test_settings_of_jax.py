@@ -90,7 +90,7 @@ def nop(key, observation):
 def test_a_task_refuses_64_bits_that_are_switched_on_later(name):
     task = jaxsense.make(name)
     with jax.enable_x64(True):
-        for use in (task.reset, lambda key: jaxsense.tasks.mean_return(key, task, None, 2)):
+        for use in (task.reset, lambda key: jaxsense.tasks.mean_return(key, task, nop, 2)):
             with pytest.raises(ConfigError, match="JAX_ENABLE_X64 = True: must be off"):
                 use(KEY)
 
