@@ -37,6 +37,16 @@ def numbered_bank():
     return tuple(jnp.asarray(x, jnp.float32) for x in stacked)
 
 
+def test_an_arena_that_was_built_while_tracing_serves_others(models):
+    config = replace(CONFIG, arena=replace(CONFIG.arena, side=3.5))
+
+    def reset(key):
+        return map_mdp.reset(key, looks.make_mdp(config, models))
+
+    for _ in range(2):
+        jax.eval_shape(reset, jax.random.key(0))
+
+
 def test_what_is_made_twice_from_equal_settings_shares_its_programs(models):
     again = PRESETS["smoke"], JmvaeConfig(hidden=(8,))
     config = replace(again[0], jmvae=again[1])

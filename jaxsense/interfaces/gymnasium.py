@@ -19,7 +19,6 @@ from jaxsense.interfaces.extras import extra
 from jaxsense.show.task_plots import frame, frames
 from jaxsense.tasks import Environment, Task, TimeStep, registered
 from jaxsense.tasks.registry import as_task
-from jaxsense.tasks.task import MapTask, TeamTask
 
 with extra("gymnasium"):
     from gymnasium import (  # pyright: ignore[reportMissingImports]
@@ -179,7 +178,7 @@ class MapVectorEnv(VectorEnv):
         common.enter_process()
         checks.require_number("num_envs", num_envs)
         self.num_envs = num_envs
-        self._task: Task | None = played if isinstance(played, MapTask | TeamTask) else None
+        self._task: Task | None = played if isinstance(played, Task) else None
         self.metadata = {**TaskEnv.metadata} if self._task else {"render_modes": []}
         self.metadata["autoreset_mode"] = common.member(
             "autoreset_mode", AutoresetMode, autoreset_mode

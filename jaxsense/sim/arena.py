@@ -125,8 +125,10 @@ def _built(
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
     # By default MJX takes the first device of all processes.
     device = jax.local_devices()[0]
-    model = mjx.put_model(mj_model, device=device, impl="jax")
-    return Arena(config, mj_model, model, mjx.make_data(model, device=device), len(lidar_robots))
+    with jax.ensure_compile_time_eval():  # it outlives a program that is being traced
+        model = mjx.put_model(mj_model, device=device, impl="jax")
+        data = mjx.make_data(model, device=device)
+    return Arena(config, mj_model, model, data, len(lidar_robots))
 
 
 def _mjcf(

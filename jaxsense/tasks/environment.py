@@ -1,6 +1,6 @@
 """What a task is to those who learn in it: an MDP of one policy, as a few pure functions."""
 
-from typing import Protocol
+import abc
 
 import jax
 import jax.numpy as jnp
@@ -63,42 +63,37 @@ class TimeStep:
     truncated: jax.Array
 
 
-class Environment(Protocol):
+@pytree
+class Environment(abc.ABC):
     """An environment in which one policy makes all choices; a pytree.
 
     Attributes:
       mdp: the MDP.
-      num_actions: A; the last action is NOP, which ends the agent's work.
-      observation_size: S.
-      bound: observations are within plus and minus this.
-      max_steps: actions after which an episode is truncated.
     """
 
-    @property
-    def mdp(self) -> MapMdp | TeamMdp:
-        """The MDP."""
-        ...
+    mdp: MapMdp | TeamMdp
 
     @property
     def num_actions(self) -> int:
-        """A."""
-        ...
-
-    @property
-    def observation_size(self) -> int:
-        """S."""
-        ...
-
-    @property
-    def bound(self) -> float:
-        """Of observations."""
-        ...
+        """A: a look at each PoI, and NOP, the last, which ends the agent's work."""
+        return self.mdp.map.num_pois + 1
 
     @property
     def max_steps(self) -> int:
-        """Actions in an episode, at most."""
-        ...
+        """Actions after which an episode is truncated."""
+        return self.mdp.config.max_steps
 
+    @property
+    @abc.abstractmethod
+    def observation_size(self) -> int:
+        """S."""
+
+    @property
+    @abc.abstractmethod
+    def bound(self) -> float:
+        """Observations are within plus and minus this."""
+
+    @abc.abstractmethod
     def reset(self, key: Key) -> tuple[Float[Array, " S"], PyTree]:
         """Starts an episode.
 
@@ -111,16 +106,16 @@ class Environment(Protocol):
         Raises:
           ConfigError: if JAX computes in 64 bits.
         """
-        ...
 
+    @abc.abstractmethod
     def observe(self, state: PyTree) -> Float[Array, " S"]:
         """What the agent sees of a state."""
-        ...
 
+    @abc.abstractmethod
     def action_mask(self, state: PyTree) -> Bool[Array, " A"]:
         """`[A]` bool, the actions that exist in a state."""
-        ...
 
+    @abc.abstractmethod
     def step(self, key: Key, state: PyTree, action: Int[Array, ""]) -> tuple[PyTree, TimeStep]:
         """Takes an action. An episode that has ended is not restarted.
 
@@ -132,11 +127,10 @@ class Environment(Protocol):
         Returns:
           The next state, and what the agent sees of it.
         """
-        ...
 
 
 @pytree
-class OneAgent:
+class OneAgent(Environment):
     """The map MDP of one agent, whose observations are not scaled; see `Environment`.
 
     Attributes:
@@ -148,11 +142,6 @@ class OneAgent:
     modality: int = struct.field(pytree_node=False)
 
     @property
-    def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
-        return self.mdp.num_pois + 1
-
-    @property
     def observation_size(self) -> int:
         """Mean and standard deviation of each PoI's belief."""
         return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
@@ -161,11 +150,6 @@ class OneAgent:
     def bound(self) -> float:
         """None: infinity."""
         return float("inf")
-
-    @property
-    def max_steps(self) -> int:
-        """Actions in an episode, at most."""
-        return self.mdp.config.max_steps
 
     def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
         """Starts an episode, see `Environment.reset`."""

@@ -1,7 +1,6 @@
 """The frozen tasks by name, and how one is frozen."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -235,19 +234,18 @@ def _made(
     if agent not in acting:
         expected = "must be one of " if len(acting) > 1 else "must be "
         raise ConfigError("agent", agent, expected + ", ".join(acting))
-    common: dict[str, PyTree] = {
+    parts_of_all: dict[str, PyTree] = {
         "mdp": make_mdp(config, parts, looks),
         "models": parts,
         "scaling": scaling,
         "returns": jnp.asarray(arrays.get(f"returns/{agent}", _NONE)),
         "name": name,
+        "agent": agent,
         "modalities": config.modalities,
     }
-    kinds: dict[str, Callable[[], Task]] = {
-        "map": lambda: MapTask(**common, modality=config.modalities.index(agent), agent=agent),
-        "team": lambda: TeamTask(**common, robots=jnp.array(config.modality_of_robot, jnp.int32)),
-    }
-    return kinds[config.dqn.task]()
+    if config.dqn.task == "team":
+        return TeamTask(**parts_of_all, robots=jnp.array(config.modality_of_robot, jnp.int32))
+    return MapTask(**parts_of_all, modality=config.modalities.index(agent))
 
 
 def _scaling(key: Key, task: Task) -> Scaling:

@@ -4,9 +4,10 @@ A task is an MDP with frozen networks whose looks are drawn from stored detectio
 part of its name and changes with anything that changes a score.
 """
 
+import abc
 import contextlib
 from collections.abc import Callable, Iterator
-from typing import Protocol, TypeVar
+from typing import ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -40,79 +41,71 @@ Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 """`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
 
 
-class Task(Environment, Protocol):
+@pytree
+class Task(Environment):
     """A frozen task: an environment with fixed networks and looks; a pytree.
 
     Attributes:
-      name: with its version.
-      agent: who acts.
-      references: names of the policies that `play_reference` plays.
-      has_optimum: whether the first one is optimal.
-      models: frozen networks, and the agent that learns in the preset of the task.
+      models: frozen networks, of which only those that the references read are there, and the agent
+        that learns in the preset of the task.
       scaling: of observations.
-      returns: `[R, seeds]` mean return of each reference with each seed of a score.
+      returns: `[R, seeds]` mean return of each reference with each seed of a score, see
+        `registry.reference_returns`.
+      name: with its version.
+      agent: who acts: the name of a sensor, or `team` for all robots.
+      modalities: names of all sensors.
+      references: names of the policies that `play_reference` plays, to compare with.
+      has_optimum: whether the first one is optimal.
     """
 
-    @property
-    def models(self) -> Models:
-        """Frozen networks."""
-        ...
+    models: Models
+    scaling: Scaling
+    returns: jax.Array
+    name: str = struct.field(pytree_node=False)
+    agent: str = struct.field(pytree_node=False)
+    modalities: tuple[str, ...] = struct.field(pytree_node=False)
+    references: ClassVar[tuple[str, ...]]
+    has_optimum: ClassVar[bool]
+
+    def __repr__(self) -> str:
+        """How to make the task; its numbers would fill pages."""
+        return f"jaxsense.make({self.name!r}, {self.agent!r})"
 
     @property
-    def returns(self) -> jax.Array:
-        """`[R, seeds]`, see `registry.reference_returns`."""
-        ...
+    def observation_size(self) -> int:
+        """The features of all PoIs."""
+        return self.scaling.offset.size * self.mdp.map.num_pois
 
     @property
-    def scaling(self) -> Scaling:
-        """Of observations."""
-        ...
+    def bound(self) -> float:
+        """Observations are clipped there."""
+        return self.scaling.bound
 
-    @property
-    def name(self) -> str:
-        """The name with its version."""
-        ...
+    def observe(self, state: PyTree) -> Float[Array, " S"]:
+        """What the agent sees of a state: its features, scaled."""
+        return self.scaling(self.features(state))
 
-    @property
-    def agent(self) -> str:
-        """Who acts."""
-        ...
-
-    @property
-    def modalities(self) -> tuple[str, ...]:
-        """Names of the sensors."""
-        ...
-
-    @property
-    def references(self) -> tuple[str, ...]:
-        """Names of the policies to compare with."""
-        ...
-
-    @property
-    def has_optimum(self) -> bool:
-        """Whether the first reference is optimal."""
-        ...
-
+    @abc.abstractmethod
     def features(self, state: PyTree) -> Float[Array, "N F"]:
         """`[N, F]` what an observation holds of each PoI, not yet scaled."""
-        ...
 
+    @abc.abstractmethod
     def learning(self, agent: Agent) -> environments.Environment[PyTree]:
         """What `dqn.train` learns in.
 
         Args:
           agent: the learner, as `models.agent` or with other settings.
         """
-        ...
 
+    @abc.abstractmethod
     def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
         """What an agent's Q-network reads, from an observation.
 
         Args:
           observation: `[S]` scaled, of the task.
         """
-        ...
 
+    @abc.abstractmethod
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
         """Plays an episode with a policy.
 
@@ -124,8 +117,8 @@ class Task(Environment, Protocol):
         Returns:
           `[]` total reward, without discount.
         """
-        ...
 
+    @abc.abstractmethod
     def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """Plays an episode with a policy to compare with.
 
@@ -133,52 +126,27 @@ class Task(Environment, Protocol):
           key: random key, see `play`.
           name: one of `references`; static.
         """
-        ...
-
-
-def _as_made(task: Task) -> str:
-    """How to make a task; its numbers would fill pages."""
-    return f"jaxsense.make({task.name!r}, {task.agent!r})"
 
 
 @pytree
-class MapTask(OneAgent):
+class MapTask(OneAgent, Task):
     """A task in the map MDP: one agent looks at PoIs until it has seen enough.
 
-    Attributes:
-      models: frozen networks, of which only those that the references read are there.
-      scaling: of observations.
-      returns: `[R, seeds]` see `Task`.
-      name: with its version.
-      agent: name of the agent's sensor.
-      modalities: names of all sensors.
+    Dynamic programming finds the optimum, see `dqn.reference`.
     """
 
-    models: Models
-    scaling: Scaling
-    returns: jax.Array
-    name: str = struct.field(pytree_node=False)
-    agent: str = struct.field(pytree_node=False)
-    modalities: tuple[str, ...] = struct.field(pytree_node=False)
-
-    def __repr__(self) -> str:
-        """See `_as_made`."""
-        return _as_made(self)
+    references = ("optimal", "greedy", "naive", "random")
+    has_optimum = True
+    __repr__ = Task.__repr__
 
     @property
     def bound(self) -> float:
         """Observations are clipped there."""
         return self.scaling.bound
 
-    @property
-    def references(self) -> tuple[str, ...]:
-        """The optimum, and policies of `dqn.POLICIES`."""
-        return "optimal", "greedy", "naive", "random"
-
-    @property
-    def has_optimum(self) -> bool:
-        """True: dynamic programming finds it, see `dqn.reference`."""
-        return True
+    def observe(self, state: MapState) -> Float[Array, " S"]:
+        """What the agent sees: the map, scaled."""
+        return Task.observe(self, state)
 
     def features(self, state: MapState) -> Float[Array, "N F"]:
         """`[N, 2D]` mean and standard deviation of each PoI's belief, not yet scaled."""
@@ -191,10 +159,6 @@ class MapTask(OneAgent):
     def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
         """The map, see `Task.inputs`."""
         return self.scaling.inverse(observation).reshape(-1)
-
-    def observe(self, state: MapState) -> Float[Array, " S"]:
-        """What the agent sees: the map, scaled."""
-        return self.scaling(self.features(state))
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
         """Plays an episode, see `Task.play`; the k-th look at a PoI shows the same to all."""
@@ -226,67 +190,21 @@ class MapTask(OneAgent):
 
 
 @pytree
-class TeamTask:
+class TeamTask(Task):
     """A task in the team MDP: robots choose in turn, drive and look, and time has a cost.
 
     One policy chooses for all robots; each observation is what the robot knows whose turn it is.
+    Nobody knows the optimum; the references are rules of `dqn.POLICIES`.
 
     Attributes:
-      mdp: the MDP.
-      models: frozen networks, of which only those that the references read are there.
-      scaling: of observations.
-      returns: `[R, seeds]` see `Task`.
       robots: `[R]` int32 index of each robot's sensor.
-      name: with its version.
-      modalities: names of all sensors.
     """
 
     mdp: TeamMdp
-    models: Models
-    scaling: Scaling
-    returns: jax.Array
     robots: jax.Array
-    name: str = struct.field(pytree_node=False)
-    modalities: tuple[str, ...] = struct.field(pytree_node=False)
-
-    def __repr__(self) -> str:
-        """See `_as_made`."""
-        return _as_made(self)
-
-    @property
-    def agent(self) -> str:
-        """All robots."""
-        return "team"
-
-    @property
-    def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
-        return self.mdp.map.num_pois + 1
-
-    @property
-    def observation_size(self) -> int:
-        """What a robot knows of each PoI, see `team_mdp.observation`."""
-        return self.mdp.num_features * self.mdp.map.num_pois
-
-    @property
-    def bound(self) -> float:
-        """Observations are clipped there."""
-        return self.scaling.bound
-
-    @property
-    def max_steps(self) -> int:
-        """Actions in an episode, at most."""
-        return self.mdp.config.max_steps
-
-    @property
-    def references(self) -> tuple[str, ...]:
-        """Rules of `dqn.POLICIES`."""
-        return "nearest", "auction", "rollout", "naive", "random"
-
-    @property
-    def has_optimum(self) -> bool:
-        """False: nobody knows it."""
-        return False
+    references = ("nearest", "auction", "rollout", "naive", "random")
+    has_optimum = False
+    __repr__ = Task.__repr__
 
     def features(self, state: TeamState) -> Float[Array, "N F"]:
         """`[N, F]` what the robot knows whose turn it is, not yet scaled."""
@@ -307,10 +225,6 @@ class TeamTask:
         require_32_bits()
         state = team_mdp.reset(key, self.mdp, self.robots)
         return self.observe(state), state
-
-    def observe(self, state: TeamState) -> Float[Array, " S"]:
-        """What the robot sees whose turn it is."""
-        return self.scaling(self.features(state))
 
     def action_mask(self, state: TeamState) -> Bool[Array, " A"]:
         """`[A]` bool: the PoIs that are present, and NOP."""
