@@ -110,22 +110,26 @@ def test_examples_of_the_tasks_run(capsys):
     assert np.all(played["is_live"][:, :-1] >= played["is_live"][:, 1:])
     capsys.readouterr()
     run_example(page, 2)
+    from_observation, of_state = capsys.readouterr().out.splitlines()
+    assert from_observation == of_state
+    assert "False" in of_state
+    run_example(page, 3)
     assert "noisy-v0, camera, 10 seeds: return" in capsys.readouterr().out
-    on_host = run_example(page, 3)["found"]
+    on_host = run_example(page, 4)["found"]
     assert capsys.readouterr().out.endswith("(10,)\n")
     assert 0 < on_host.fraction_of_optimal.low <= on_host.fraction_of_optimal.value <= 1
-    run_example(page, 4)
-    assert "noisy-v0, camera, 10 seeds: return" in capsys.readouterr().out
     run_example(page, 5)
-    assert "mine" in capsys.readouterr().out
+    assert "noisy-v0, camera, 10 seeds: return" in capsys.readouterr().out
     run_example(page, 6)
+    assert "mine" in capsys.readouterr().out
+    run_example(page, 7)
     printed = capsys.readouterr().out
     learned, random = (
         float(re.search(rf"{name}:?(?: return)? (-?[\d.]+)", printed)[1])
         for name in (r"map-v0, camera, \d+ seeds?", "random")
     )
     assert learned > random
-    assert run_example(page, 7)["models"].tours
+    assert run_example(page, 8)["models"].tours
     assert "--preset team --seed 0" in capsys.readouterr().out
 
 

@@ -239,8 +239,7 @@ class SensorConfig(Checked, place="sensor"):
 
     def check(self) -> None:
         """Checks that `make` can be the name of a function; raises `ConfigError`."""
-        is_name = is_function_name(self.make)
-        require(is_name, self, "make", "must be package.module:function")
+        require(is_function_name(self.make), self, "make", "must be package.module:function")
 
 
 def _check_window(sensor: LidarConfig | CameraConfig, num_rays: int) -> None:

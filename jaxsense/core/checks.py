@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxsense.core.types import Belief
 
 P = ParamSpec("P")
-R = TypeVar("R")
+T = TypeVar("T")
 
 _MOST_SHOWN = 80  # characters of a value
 _ARRAYS = jax.Array | np.ndarray | np.generic | float | int
@@ -217,7 +217,7 @@ def require_type(name: str, value: object, kind: type, source: str) -> None:
         raise ValueError(f"{name} = {_shown(value)}: {expected}")
 
 
-def typed(function: Callable[P, R]) -> Callable[P, R]:
+def typed(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator of a public function: arguments must be of the classes that annotate them.
 
     Checks dataclasses, members of protocols, and `key`; raises `ValueError` for something else.
@@ -228,7 +228,7 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
     signature = inspect.signature(function)
 
     @functools.wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name == "key":
                 require_key(value)

@@ -255,6 +255,19 @@ def test_the_log_wrapper_sums_rewards(env):
     assert (returned != 0).all()
 
 
+def test_the_manager_of_rollouts_takes_masks_as_the_page_says(env):
+    from jaxmarl.wrappers.baselines import CTRolloutManager
+
+    manager = CTRolloutManager(env, batch_size=4)
+    _, states = manager.batch_reset(jax.random.key(10))
+    assert all(mask.all() for mask in manager.get_valid_actions(states).values())
+    manager.get_valid_actions = jax.vmap(env.get_avail_actions)
+    # At first the first robot chooses, and the others have NOP alone.
+    for agent, mask in manager.get_valid_actions(states).items():
+        np.testing.assert_array_equal(mask[:, -1], True)
+        assert mask[:, :-1].any() == (agent == AGENTS[0])
+
+
 @pytest.mark.parametrize("action", [-3, 5, 0.7])
 def test_actions_that_do_not_exist_are_refused_or_reward_nan(env, step_env, action):
     _, state = env.reset(jax.random.key(3))
