@@ -156,7 +156,7 @@ class LidarConfig(Section, place="lidar"):
     """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam returns a distance between that of its surface and that of its
-    neighbour's; at an edge, this is a point in empty space."""
+    neighbour's, if both are in range; at an edge, this is a point in empty space."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
@@ -191,7 +191,8 @@ class CameraConfig(Section, place="camera"):
     low_light: float = limited(0.0, at_least=0, at_most=1)
     """Maximum share of the light that may be missing in an image; the share is uniform from 0."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
-    """Probability of a shadow: on one side of a random pixel, only ambient light remains."""
+    """Probability of a shadow: on one side of a random pixel of the image, only ambient
+    light remains."""
     light_distance: Traced[float] = limited(0.5, above=0)
     """Distance over which exposure, colour cast, low light and shadow change, in metres: their
     correlation is a Gaussian function of the distance, with this standard deviation."""

@@ -28,9 +28,10 @@ def measured_ranges(
       Measured ranges, in metres; `max_range` without a return.
     """
     checks.require_shape("distance", distance, (None,))
-    is_disturbed = config.mixed_pixels > 0 or config.dropout > 0
-    met = _disturbed(key, distance, config) if is_disturbed else distance
-    spread = config.range_noise
+    met, spread = distance, config.range_noise
+    if config.mixed_pixels > 0 or config.dropout > 0:
+        key, disturbance_key = jax.random.split(key)
+        met = _disturbed(disturbance_key, distance, config)
     if config.range_noise_growth > 0:
         spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
     noise = spread * jax.random.normal(key, met.shape)
@@ -40,12 +41,12 @@ def measured_ranges(
 
 def _disturbed(key: Key, distance: Float[Array, "B"], config: LidarConfig) -> Float[Array, "B"]:
     """Distances with mixed pixels, infinite where a beam drops out."""
-    # Folded in: `key` draws the noise, which must not depend on what is switched on.
-    uniform = jax.random.uniform(jax.random.fold_in(key, 1), (3, *distance.shape))
-    # The last beam has no neighbour. The scanner detects nothing beyond its range.
-    within = jnp.minimum(distance, config.max_range)
-    following = jnp.append(within[1:], within[-1:])
-    between = within + uniform[0] * (following - within)
+    uniform = jax.random.uniform(key, (3, *distance.shape))
+    # The last beam has no neighbour.
+    following = jnp.append(distance[1:], distance[-1:])
+    # Nothing lies between a surface and nothing. The scanner detects nothing beyond its range.
+    is_edge = jnp.maximum(distance, following) <= config.max_range
+    between = distance + uniform[0] * jnp.where(is_edge, following - distance, 0.0)
     met = jnp.where(uniform[1] < config.mixed_pixels, between, distance)
     return jnp.where(uniform[2] < config.dropout, jnp.inf, met)
 
@@ -57,13 +58,13 @@ def changes_light(config: CameraConfig) -> bool:
 
 
 def lighting(
-    values: Float[Array, "8"], num_pixels: int, config: CameraConfig
+    values: Float[Array, "8"], place: Float[Array, "B"], config: CameraConfig
 ) -> tuple[Float[Array, "3"], Float[Array, "B"]]:
     """Tells how an image is lit and exposed.
 
     Args:
       values: of the light's conditions where and when the camera looks.
-      num_pixels: number of pixels, B.
+      place: of the pixels in the whole image, from 0 at its left to 1 at its right.
       config: settings of the camera.
 
     Returns:
@@ -74,6 +75,5 @@ def lighting(
     missing, falls, edge, side = jax.scipy.special.ndtr(values[4:])  # uniform from 0 to 1
     logarithm = config.exposure_error * brightness + config.colour_cast * jnp.stack(casts)
     gain = (1 - config.low_light * missing) * jnp.exp(logarithm)
-    is_beyond = jnp.arange(num_pixels) >= edge * num_pixels
-    is_dark = (falls < config.shadow) & (is_beyond == (side < 0.5))
+    is_dark = (falls < config.shadow) & ((place >= edge) == (side < 0.5))
     return gain, jnp.where(is_dark, 0.0, 1.0)

@@ -63,11 +63,14 @@ class Hit:
       distance: `[...]` float32, in metres; infinite without a hit.
       geom: `[...]` int32 MuJoCo geom id; -1 without a hit.
       normal: x and y, `[...]` float32 each, of the surface's outward unit normal; 0 without a hit.
+      ray: `[...]` float32 index of the ray among all rays of the sensor; None until `sensors.scan`
+        sets it.
     """
 
     distance: jax.Array
     geom: jax.Array
     normal: tuple[jax.Array, jax.Array]
+    ray: jax.Array | None = None
 
 
 @checks.typed

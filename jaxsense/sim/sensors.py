@@ -78,7 +78,8 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
 
         Args:
           key: random key of the noise.
-          hits: `[B]` first hits of the rays.
+          hits: `[B]` first hits of the rays: of a whole scan, or of some of its rays, which
+            `hits.ray` tells.
           surfaces: colour and attributes of all geoms, for `raycast.choose`.
           light: the light, with the point where and when the sensor looks.
 
@@ -107,6 +108,11 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     @property
     def reads_conditions(self) -> bool:
         """Whether `read` needs `light.conditions`; by default not, and they may not be drawn."""
+        return False
+
+    @property
+    def reads_neighbours(self) -> bool:
+        """Whether a ray's reading depends on the next ray's hit, too; by default not."""
         return False
 
     def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
@@ -170,6 +176,11 @@ class Lidar(Sensor):
         del surfaces, light
         return disturbances.measured_ranges(key, hits.distance, self.config)
 
+    @property
+    def reads_neighbours(self) -> bool:
+        """See `Sensor.reads_neighbours`: whether there are mixed pixels."""
+        return self.config.mixed_pixels > 0
+
 
 class Camera(Sensor):
     """One line of a camera's pixels: linear RGB in [0, 1], from left to right.
@@ -195,7 +206,9 @@ class Camera(Sensor):
         direct, gain = light.diffuse * jnp.maximum(facing, 0.0), None
         if self.reads_conditions:
             values = light.changes(self.config.light_distance, self.config.light_time)
-            gain, is_lit = disturbances.lighting(values, len(facing), self.config)
+            checks.require_shape("hits.ray", hits.ray, hits.geom.shape)
+            place = hits.ray / self.config.num_pixels
+            gain, is_lit = disturbances.lighting(values, place, self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
         noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
@@ -333,7 +346,8 @@ def scan(
       light: the light.
       robot: index of the robot that carries the sensor and does not see its own body. May be
         traced; a static index saves casting rays at that body.
-      directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan.
+      directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan. A mixed
+        pixel lies between the surfaces of two of these rays, one after the other.
       seconds: time of the scan, over which the light changes.
       twin: position of one more robot with the body of the one that scans, in metres.
 
@@ -352,6 +366,7 @@ def scan(
     x, y = directions
     in_world = raycast.turned((x, y), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
+    hits = dataclasses.replace(hits, ray=jax.vmap(sensor.centre)(jnp.arctan2(y, x)))
     light = dataclasses.replace(light, point=jnp.append(pose[:2], seconds))
     return sensor.read(key, hits, surfaces(arena, layout), light)
 

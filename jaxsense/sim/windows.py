@@ -34,6 +34,25 @@ def window_of(
     return jax.lax.dynamic_slice(strided, first, (*shape, sensor.window, 1))[..., 0]
 
 
+def rays_of(sensor: Sensor, bearing: Float[Array, ""]) -> Float[Array, "2 _"]:
+    """Selects the directions of the rays that the readings of a window need.
+
+    Args:
+      sensor: the sensor.
+      bearing: see `window_of`.
+
+    Returns:
+      Directions of the window's rays; if the sensor reads neighbours, of all rays from the window's
+      first to the one after its last.
+    """
+    if not sensor.reads_neighbours:
+        return window_of(sensor, sensor.directions, bearing)
+    # The last ray of all has no neighbour but itself.
+    padded = jnp.array(np.pad(sensor.directions, [(0, 0), (0, 1)], mode="edge"))
+    number = (sensor.window - 1) * sensor.stride + 2
+    return jax.lax.dynamic_slice_in_dim(padded, _first_ray(sensor, bearing), number, axis=1)
+
+
 def _first_ray(sensor: Sensor, bearing: Float[Array, ""]) -> Int[Array, ""]:
     """Index of the first ray that the detector reads around a bearing."""
     span = (sensor.window - 1) * sensor.stride

@@ -118,7 +118,7 @@ def look(
 ) -> tuple[Float[Array, "F"], Scene]:
     """Places a robot at a random viewpoint of a PoI, and scans the PoI.
 
-    Casts only the rays that the detector reads; their readings are those of a whole scan.
+    Casts only the rays that it needs; readings have the distribution of those of a whole scan.
 
     Args:
       key: random key.
@@ -223,11 +223,11 @@ def scan_around(
       The readings of the rays that the detector reads.
     """
     sensor = world.sensors[modality]
-    rays = windows.window_of(sensor, sensor.directions, bearing)
-    layout, light = scene.layout, scene.light
-    return sensors.scan(
+    rays, (layout, light) = windows.rays_of(sensor, bearing), (scene.layout, scene.light)
+    readings = sensors.scan(
         key, sensor, world.arena, data, layout, light, robot, rays, seconds=seconds, twin=twin
     )
+    return readings[: -1 : sensor.stride] if sensor.reads_neighbours else readings
 
 
 def survey(

@@ -1,12 +1,16 @@
 """Disturbances of the sensors: hand-worked cases, and nothing at all while they are off."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
-from jaxsense.config import CameraConfig, LidarConfig
-from jaxsense.sim import disturbances, sensors
+from jaxsense import sim
+from jaxsense.config import CameraConfig, LidarConfig, ViewpointConfig
+from jaxsense.sim import disturbances, sensors, windows, world
 from jaxsense.sim.light import Light, random_conditions
 from jaxsense.sim.raycast import Hit
 
@@ -16,7 +20,8 @@ EXACT = {"range_noise": 0.0, "max_range": 5.0}
 
 
 measure = jax.jit(jax.vmap(disturbances.measured_ranges, in_axes=(0, None, None)))
-lighting_of = jax.jit(jax.vmap(disturbances.lighting, in_axes=(0, None, None)), static_argnums=1)
+lighting_of = jax.jit(jax.vmap(disturbances.lighting, in_axes=(0, None, None)))
+TENTHS = jnp.arange(10) / 10
 
 
 def ranges(distance, **settings):
@@ -34,7 +39,7 @@ def values():
 @pytest.fixture(scope="module")
 def lighting(values):
     def of_scenes(**settings):
-        gain, is_lit = lighting_of(values, 10, CameraConfig(**settings))
+        gain, is_lit = lighting_of(values, TENTHS, CameraConfig(**settings))
         return np.asarray(gain), np.asarray(is_lit)
 
     return of_scenes
@@ -55,14 +60,68 @@ def test_noise_grows_with_the_distance():
 
 
 def test_a_mixed_pixel_lies_between_its_surface_and_the_next():
-    found = ranges([1.0, 1.0, 3.0, np.inf, np.inf], mixed_pixels=0.25, **EXACT)
-    np.testing.assert_array_equal(found[:, [0, 4]], np.broadcast_to([1.0, 5.0], (NUMBER, 2)))
-    for beam, low, high in ((1, 1.0, 3.0), (2, 3.0, 5.0)):
-        mixed = found[:, beam][found[:, beam] != low]
+    clean = [1.0, 1.0, 3.0, 2.0, np.inf, 2.0, 6.0, 4.0]
+    found = ranges(clean, mixed_pixels=0.25, **EXACT)
+    # Nothing lies between a surface and nothing, nor one beyond the range; the last is alone.
+    edges, others = [1, 2], [0, 3, 4, 5, 6, 7]
+    expected = np.minimum(clean, 5.0)[others]
+    np.testing.assert_array_equal(found[:, others], np.broadcast_to(expected, (NUMBER, 6)))
+    for beam in edges:
+        low, high = sorted(clean[beam : beam + 2])
+        mixed = found[:, beam][found[:, beam] != clean[beam]]
         assert len(mixed) / NUMBER == pytest.approx(0.25, abs=0.015)
-        assert mixed.min() > low
-        assert mixed.max() < high
+        assert low < mixed.min() < mixed.max() < high
         assert mixed.mean() == pytest.approx((low + high) / 2, abs=0.05)
+
+
+@pytest.fixture(scope="module")
+def scans(arena, place, known_layout):
+    """`[NUMBER, window]` readings of windows, and those of the same windows of whole scans."""
+    data = place(known_layout, jnp.array([[0.5, 0.0, np.pi], [-0.5, 0.0, 0.0]]))
+
+    @jax.jit
+    def read(sensor, bearing):
+        robot = int(sensor.measures_distance)
+        simulation = sim.World(arena, (sensor, sensor), ViewpointConfig(), None)
+
+        def each(key):
+            scan_key, light_key = jax.random.split(key)
+            light = Light(jnp.array([0.8, 0.0, 0.6]), jnp.float32(0.5), jnp.float32(0.25))
+            light = dataclasses.replace(light, conditions=random_conditions(light_key))
+            scene = sim.Scene(known_layout, light, jnp.zeros((2, 3)))
+            window = world.scan_around(scan_key, simulation, scene, data, robot, bearing, robot)
+            rays = sensor.directions
+            whole = sim.scan(scan_key, sensor, arena, data, known_layout, light, robot, rays)
+            return window, windows.around(sensor, whole, bearing)
+
+        first, second = jnp.split(KEYS[:6000], 2)
+        return jax.vmap(each)(first)[0], jax.vmap(each)(second)[1]
+
+    return read
+
+
+CAMERA = CameraConfig(shadow=0.8, num_pixels=64, window=16, stride=2)
+LIDAR = LidarConfig(range_noise=0.001, mixed_pixels=0.5, dropout=0.05, window=12)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "bearing"),
+    [
+        (sensors.camera(CAMERA), 0.1),
+        # The cylinder ahead ends with beam 373, at .2 rad.
+        (sensors.lidar(LIDAR), 0.172),
+        (sensors.lidar(LIDAR), 2.2),  # at the last beam
+        (sensors.lidar(dataclasses.replace(LIDAR, stride=3)), 0.2),
+    ],
+)
+def test_a_window_has_the_statistics_of_a_whole_scan(scans, sensor, bearing):
+    window, whole = (np.reshape(x, (3000, sensor.window, -1)) for x in scans(sensor, bearing))
+    both = window[..., -1], whole[..., -1]
+    assert all(scipy.stats.ks_2samp(*rays).pvalue > 1e-4 for rays in np.moveaxis(both, 2, 0))
+    # Together, too: how much of a window is in shadow, and how many beams are mixed.
+    for of_scan in (np.mean, np.std, np.ptp):
+        pair = (of_scan(x, axis=1) for x in both)
+        assert scipy.stats.ks_2samp(*pair).pvalue > 1e-4
 
 
 def test_a_beam_that_drops_out_reads_as_one_without_a_return():
@@ -108,14 +167,14 @@ def test_hand_worked_light():
     # A standard normal value is below -.253347 with a chance of .4, below .524401 with .7, and
     # below .5 with .691.
     values = jnp.array([2.0, 1.0, 0.0, -1.0, 0.524401, -0.2534, 0.5, 0.1])
-    gain, is_lit = disturbances.lighting(values, 10, config)
+    gain, is_lit = disturbances.lighting(values, TENTHS, config)
     # (1 - .8 * .7) exp(.5 * 2 + .1 * {1, 0, -1}); dark before pixel 7, the first beyond .691.
     expected = 0.44 * np.exp([1.1, 1.0, 0.9])
     np.testing.assert_allclose(gain, expected, rtol=1e-5)
     np.testing.assert_array_equal(is_lit, [0] * 7 + [1] * 3)
-    _, is_lit = disturbances.lighting(values.at[7].set(-0.1), 10, config)
+    _, is_lit = disturbances.lighting(values.at[7].set(-0.1), TENTHS, config)
     np.testing.assert_array_equal(is_lit, [1] * 7 + [0] * 3)
-    _, is_lit = disturbances.lighting(values.at[5].set(-0.2532), 10, config)
+    _, is_lit = disturbances.lighting(values.at[5].set(-0.2532), TENTHS, config)
     np.testing.assert_array_equal(is_lit, 1)
 
 
@@ -129,7 +188,7 @@ def test_a_shadow_leaves_the_ambient_light():
         jnp.zeros(3),
     )
     rays = jnp.ones(80)
-    hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays))
+    hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays), 8.0 * jnp.arange(80))
     colour = {"colour": jnp.array([[0.8, 0.4, 0.2]])}
     image = np.asarray(camera.read(KEYS[0], hits, colour, light))
     lit, dark = 0.75 * np.array([0.8, 0.4, 0.2]), 0.25 * np.array([0.8, 0.4, 0.2])

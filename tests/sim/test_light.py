@@ -16,7 +16,7 @@ from jaxsense.sim.raycast import Hit
 NUMBER = 20_000
 KEYS = jax.random.split(jax.random.key(0), NUMBER)
 SOMEWHERE = np.array([1.0, -2.0, 3.0])
-ONE_RAY = Hit(jnp.ones(1), jnp.zeros(1, jnp.int32), (jnp.ones(1), jnp.zeros(1)))
+ONE_RAY = Hit(jnp.ones(1), jnp.zeros(1, jnp.int32), (jnp.ones(1), jnp.zeros(1)), jnp.zeros(1))
 WHITE = {"colour": jnp.ones((1, 3))}
 
 
@@ -137,7 +137,8 @@ def test_a_camera_meets_almost_the_same_light_nearby_and_another_far_away(
 def test_the_light_persists_while_the_noise_of_pixels_is_new():
     light = sim.random_light(KEYS[0], has_conditions=True)
     light = dataclasses.replace(light, point=jnp.zeros(3))
-    hits = Hit(jnp.ones(80), jnp.zeros(80, jnp.int32), (jnp.ones(80), jnp.zeros(80)))
+    rays = jnp.ones(80)
+    hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays), 8.0 * jnp.arange(80))
     for noise in (0.0, 0.01):
         settings = {"exposure_error": 0.3, "colour_cast": 0.3, "low_light": 0.5, "shadow": 0.3}
         camera = sensors.camera(CameraConfig(pixel_noise=noise, **settings))
@@ -154,5 +155,8 @@ def test_light_without_what_a_camera_needs_is_refused():
         camera.read(KEYS[0], ONE_RAY, WHITE, plain)
     with pytest.raises(ValueError, match=r"^light\.point = None: must be set"):
         camera.read(KEYS[0], ONE_RAY, WHITE, sim.random_light(KEYS[0], has_conditions=True))
+    light = dataclasses.replace(sim.random_light(KEYS[0], True), point=jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"^hits\.ray = None: must be an array"):
+        camera.read(KEYS[0], dataclasses.replace(ONE_RAY, ray=None), WHITE, light)
     assert camera.reads_conditions
     assert not sensors.camera(CameraConfig()).reads_conditions
