@@ -207,7 +207,7 @@ class Camera(Sensor):
         if self.reads_conditions:
             values = light.changes(self.config.light_distance, self.config.light_time)
             checks.require_shape("hits.ray", hits.ray, hits.geom.shape)
-            place = hits.ray / self.config.num_pixels
+            place = jnp.asarray(hits.ray) / self.config.num_pixels
             gain, is_lit = disturbances.lighting(values, place, self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
