@@ -81,7 +81,7 @@ def _made(run: Path) -> dict[str, object]:
     """What made the models of a run."""
     if (name := str(run)).startswith(PREFIX):
         return dataclasses.asdict(registry.origin(name.removeprefix(PREFIX)))
-    found: Any = parse_json((rundir.newest(run) / "config.json").read_text(encoding="utf-8"))
+    found: Any = parse_json((rundir.newest(run) / "config.json").read_bytes())
     return {name: found.get(name) for name in ("preset", "seed", "commit", "versions")}
 
 

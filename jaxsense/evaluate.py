@@ -188,6 +188,8 @@ def _write(
 def _report(run: Path, config: Config) -> Path:
     """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
     own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
+    if own.get("seeds"):
+        raise ConfigError("run", str(run), "holds several seeds; choose one")
     made = [_evaluation(config, own["mission"], own), *found.values()]
     places = [each for each in made if _is_alike(each)]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:

@@ -215,8 +215,7 @@ def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
         return _discarded(arguments.settings)
     if arguments.resume is not None:
         return RunDirectory.resume(arguments.resume, arguments.trust)
-    path = arguments.out or rundir.dated(arguments.preset)
-    return RunDirectory.create(path, arguments.settings)
+    return RunDirectory.create(arguments.out, arguments.settings)
 
 
 @contextlib.contextmanager

@@ -27,6 +27,8 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import batches, cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings
 from jaxsense.show import animation
 
 
@@ -351,12 +353,11 @@ def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expec
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     line = error_line([str(tmp_path / "none")], capsys, evaluate)
     assert f"{tmp_path / 'none'} is not a run directory: it has no config.json" in line
-    versions = {"jaxsense": jaxsense.__version__}
-    stored = {"versions": versions, "config": {"colour": 1}}
-    (tmp_path / "config.json").write_text(json.dumps(stored))
-    assert "colour = 1: unknown setting" in error_line([str(tmp_path)], capsys, evaluate)
-    (tmp_path / "config.json").write_text(json.dumps({"versions": versions}))
-    line = error_line([str(tmp_path)], capsys, evaluate)
+    (tmp_path / "config.json").write_text(json.dumps({"versions": {"jaxsense": "0.1.0"}}))
+    assert "was written by jaxsense 0.1.0" in error_line([str(tmp_path)], capsys, evaluate)
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, PRESETS["smoke"])) as run:
+        pass
+    line = error_line([str(run.path)], capsys, evaluate)
     assert "must be a finished run (there is no checkpoint 'detector_camera')" in line
 
 

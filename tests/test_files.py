@@ -132,10 +132,8 @@ with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder)):
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
     checkpoints = Checkpoints(tmp_path / "checkpoints")
-    assert not checkpoints.exists()
     assert checkpoints.load("tree", SHAPES) is None
     checkpoints.save("tree", TREE)
-    assert checkpoints.exists()
     found = checkpoints.load("tree", SHAPES)
     assert jax.tree.structure(found) == jax.tree.structure(TREE)
     for here, there in zip(jax.tree.leaves(found), jax.tree.leaves(TREE), strict=True):
@@ -146,9 +144,8 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
 def test_without_a_directory_nothing_is_saved():
     checkpoints = Checkpoints()
     checkpoints.save("tree", TREE)
-    checkpoints.forget_unfinished()
+    checkpoints.forget_unfinished(["jmvae"])
     assert checkpoints.load("tree", SHAPES) is None
-    assert not checkpoints.exists()
 
 
 DAMAGES = {
@@ -219,48 +216,53 @@ def test_a_process_that_is_killed_after_its_first_checkpoint_has_lost_no_list(
 )
 def test_a_list_of_checkpoints_that_is_damaged_is_noticed_and_made_anew(tmp_path, damage, expected):
     said = []
-    checkpoints = Checkpoints(tmp_path, said.append)
+    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
     checkpoints.check()  # nothing was saved, and nothing is missing
     checkpoints.save("tree", TREE)
     checkpoints.save("unfinished/jmvae", TREE)
     checkpoints.check()
     assert not said
-    damage(tmp_path / "saved.msgpack")
+    damage(tmp_path / "checkpoints" / "saved.msgpack")
     checkpoints.check()
     (line,) = said
     assert expected in line
+    assert line.endswith("; resuming from all checkpoints found")
     checkpoints.check()
-    assert len(said) == 1
-    # The new list holds what was there.
     for name in ("tree", "unfinished/jmvae"):
-        (tmp_path / f"{name}.msgpack").unlink()
+        assert checkpoints.load_or_forget(name, SHAPES) is not None
+    checkpoints.save("other", TREE)
+    (tmp_path / "checkpoints" / "other.msgpack").unlink()
+    assert len(said) == 1
     checkpoints.check()
-    assert ["is missing" in line for line in said[1:]] == [True, True]
-    assert checkpoints.load_or_forget("tree", SHAPES) is None
-    assert len(said) == 3
+    assert "other.msgpack': is missing; retraining it" in said[1]
+    checkpoints.check()
+    assert checkpoints.load_or_forget("other", SHAPES) is None
+    assert len(said) == 2
 
 
-def test_all_that_is_damaged_is_named_once_also_what_nobody_loads(tmp_path):
+def test_all_that_is_damaged_is_named_once(tmp_path):
     said = []
     checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
     checkpoints.check(is_begun=False)
     assert not said
     checkpoints.check(is_begun=True)
     assert "checkpoints': is missing; retraining everything" in said.pop()
-    for name in ("jmvae", "class_beliefs", "detectors"):
+    for name in ("jmvae", "class_beliefs", "detectors", "mdp"):
         checkpoints.save(name, TREE)
     file = tmp_path / "checkpoints" / "class_beliefs.msgpack"
     file.write_bytes(file.read_bytes()[:-1])
-    (tmp_path / "checkpoints" / "jmvae.msgpack").unlink()
+    for name in ("jmvae", "mdp"):
+        (tmp_path / "checkpoints" / f"{name}.msgpack").unlink()
     (tmp_path / "checkpoints" / "jmvae.msgpack").mkdir()  # cannot be read
     checkpoints.check()
-    assert "class_beliefs.msgpack': is damaged" in said[0]
-    assert "jmvae.msgpack': cannot be read (Is a directory)" in said[1]
-    checkpoints.check()
-    for name in ("jmvae", "class_beliefs"):
+    for name in ("class_beliefs", "jmvae", "mdp") * 2:
         assert checkpoints.load_or_forget(name, SHAPES) is None
+    assert "mdp.msgpack': is missing" in said[0]
+    assert "class_beliefs.msgpack': is damaged" in said[1]
+    assert "jmvae.msgpack': cannot be read (Is a directory)" in said[2]
     assert checkpoints.load_or_forget("detectors", SHAPES) is not None
-    assert len(said) == 2
+    checkpoints.check()
+    assert len(said) == 3
 
 
 def test_only_what_a_write_has_left_is_removed(tmp_path):
@@ -331,28 +333,26 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     saved = Unfinished(2, state, {"loss": [1.5, float("nan")], "none": []})
     checkpoints.save_unfinished("jmvae", saved)
     checkpoints.save("tree", TREE)
-    done, found, curves = checkpoints.load_unfinished("jmvae", state)
+    done, found, curves = checkpoints.load_unfinished("jmvae", state, 3)
     assert done == 2
     assert isinstance(found[0], FitState)
     np.testing.assert_array_equal(found[0].params["w"], [1, 1])
     np.testing.assert_array_equal(curves["loss"], [1.5, np.nan])
     assert curves["none"] == []
-    checkpoints.forget_unfinished()
+    checkpoints.forget_unfinished(["jmvae"])
     assert not (tmp_path / "unfinished").exists()
-    assert checkpoints.load_unfinished("jmvae", state) is None
+    assert checkpoints.load_unfinished("jmvae", state, 3) is None
     assert checkpoints.load("tree", SHAPES) is not None
     checkpoints.check()  # nothing is missing
 
 
 def test_files_of_others_beside_checkpoints_stay(tmp_path):
-    """Here `checkpoints` is a link to a directory where somebody keeps files of the same suffix."""
-    theirs, said = tmp_path / "theirs", []
+    theirs, said = tmp_path / "checkpoints", []
     precious = [theirs / name for name in ("a.msgpack", "unfinished/b.msgpack", "c/d.msgpack")]
     for path in precious:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("precious", encoding="utf-8")
-    (tmp_path / "checkpoints").symlink_to(theirs)
-    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
+    checkpoints = Checkpoints(theirs, said.append)
     checkpoints.save_unfinished("jmvae", Unfinished(1, TREE, {}))
     (theirs / "saved.msgpack").unlink()
     for _ in range(2):
@@ -360,7 +360,7 @@ def test_files_of_others_beside_checkpoints_stay(tmp_path):
     assert [line.partition("saved.msgpack")[2] for line in said] == [
         "': is missing; resuming from all checkpoints found"
     ]
-    assert checkpoints.load_unfinished("jmvae", TREE) is not None
-    checkpoints.forget_unfinished()
-    assert checkpoints.load_unfinished("jmvae", TREE) is None
+    assert checkpoints.load_unfinished("jmvae", TREE, 3) is not None
+    checkpoints.forget_unfinished(["jmvae"])
+    assert checkpoints.load_unfinished("jmvae", TREE, 3) is None
     assert all(path.read_text(encoding="utf-8") == "precious" for path in precious)

@@ -288,7 +288,7 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
     start = {"x": np.zeros(2, np.float32)}
     with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
         run_chunks(chunked("jmvae", 4), start, run, monitor, checkpoints)
-    done, state, curves = checkpoints.load_unfinished("jmvae", start)
+    done, state, curves = checkpoints.load_unfinished("jmvae", start, 4)
     assert (done, curves) == (2, {"chunk": [0, 1]})
     np.testing.assert_array_equal(state["x"], [2, 2])
 
@@ -324,7 +324,7 @@ def test_a_killed_training_loses_no_more_than_a_minute(tmp_path):
     ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
     assert ended.returncode == -signal.SIGKILL
     state = np.float32(0)
-    done, state, curves = Checkpoints(tmp_path).load_unfinished("jmvae", state)
+    done, state, curves = Checkpoints(tmp_path).load_unfinished("jmvae", state, 9)
     assert (done, state, curves) == (3, 3, {"chunk": [0, 1, 2]})
 
 
@@ -338,7 +338,7 @@ def test_a_stop_is_heard_after_every_chunk(tmp_path):
 
     with pytest.raises(Stopped):
         run_chunks(chunked("jmvae", 4), np.float32(0), run, monitor, checkpoints)
-    assert checkpoints.load_unfinished("jmvae", np.float32(0))[:2] == (2, 2.0)
+    assert checkpoints.load_unfinished("jmvae", np.float32(0), 4)[:2] == (2, 2.0)
 
 
 def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
@@ -369,7 +369,7 @@ def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
 
     with pytest.raises(StageError, match="dqn_lidar"):
         run_chunks(chunked("dqn_camera", 9), np.float32(0), run, monitor, checkpoints)
-    assert checkpoints.load_unfinished("dqn_camera", np.float32(0))[:2] == (1, 1.0)
+    assert checkpoints.load_unfinished("dqn_camera", np.float32(0), 9)[:2] == (1, 1.0)
     monitor.begin(lambda *_: None)  # the next seed
     monitor.check_stop()
 

@@ -246,15 +246,6 @@ def test_a_film_can_be_paused_without_a_script(run):
     assert "<script" not in document
 
 
-def test_of_a_film_of_an_earlier_version_the_last_frame_is_left(tmp_path):
-    track = '<animate attributeName="cx" values="1;2" dur="6s" repeatCount="3" />'
-    old = f'<svg viewBox="0 0 720 472"><circle cx="2" r="1">{track}</circle></svg>'
-    (write_run(tmp_path) / "mission.svg").write_text(old, encoding="utf-8")
-    document = frame_of(page.render(tmp_path, CONFIG, SUMMARY))
-    assert document.count('<circle cx="2" r="1"></circle>') == 2
-    assert "<animate" not in document
-
-
 def test_films_of_one_arena_stand_side_by_side(run, tmp_path):
     for name in ("mission", "mission-naive", "mission-naive-7"):
         shutil.copy(run / "mission.svg", tmp_path / f"{name}.svg")
@@ -263,11 +254,6 @@ def test_films_of_one_arena_stand_side_by_side(run, tmp_path):
     assert frames == [("2", "Animation mission, mission-naive"), ("1", "Animation mission-naive-7")]
     documents = map(html.unescape, re.findall('srcdoc="([^"]*)"', text))
     assert ['<main class="pair">' in document for document in documents] == [True, False]
-
-
-def test_plots_of_an_earlier_version_are_shown(tmp_path):
-    Figure(figsize=(1, 1)).savefig(tmp_path / "reward.png")
-    assert page.render(tmp_path, CONFIG, SUMMARY).count("data:image/png") == 1
 
 
 def test_devices_of_a_kind_are_counted(tmp_path):

@@ -1,5 +1,6 @@
 """Recordings of real sensors: read, checked against a run, and compared with simulated looks."""
 
+import zipfile
 from dataclasses import replace
 
 import jax
@@ -174,6 +175,30 @@ def test_a_broken_file_is_named(tmp_path, content):
     np.save(tmp_path / "one.npy", EMPTY)
     with pytest.raises(ValueError, match="is not a whole file of NumPy's format"):
         recordings.read(CONFIG, tmp_path / "one.npy")
+
+
+@pytest.mark.parametrize(
+    ("place", "byte"),
+    [
+        (6, 1),  # encrypted: zipfile raises RuntimeError
+        (6, 32),  # patched: NotImplementedError
+        (8, 97),  # an unknown compression: NotImplementedError
+        (None, 200),  # a header without its end: tokenize.TokenError, or another of its own
+    ],
+)
+def test_whatever_an_archive_makes_its_readers_raise_is_one_error(tmp_path, place, byte):
+    path = tmp_path / "recorded.npz"
+    np.savez(path, places=EMPTY)
+    content = bytearray(path.read_bytes())
+    central = content.index(b"PK\x01\x02")
+    if place is None:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("places.npy", b"\x93NUMPY\x01\x00" + bytes([byte, 0]) + b"(" * byte)
+    else:
+        content[place] = content[central + place + 2] = byte
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match="is not a whole file of NumPy's format"):
+        recordings.read(CONFIG, path)
 
 
 @pytest.fixture(scope="module")

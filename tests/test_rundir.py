@@ -1,8 +1,10 @@
 """Run directories: nobody writes into that of another."""
 
+import errno
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +14,7 @@ import jax
 import pytest
 
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run import rundir, version
+from jaxsense.run import files, rundir, version
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 
@@ -155,6 +157,71 @@ def test_a_run_that_is_refused_before_it_begins_leaves_no_directory(tmp_path, er
             fail(tmp_path / name, begun=begun)
     assert [path.name for path in tmp_path.iterdir()] == ["begun"]
     assert (tmp_path / "begun" / "config.json").exists()
+
+
+@pytest.mark.parametrize("was_there", [True, False])
+def test_only_a_directory_that_is_new_is_removed(tmp_path, was_there):
+    path = tmp_path / "theirs"
+    if was_there:
+        path.mkdir()
+    with pytest.raises(ConfigError, match="a = 1"), RunDirectory.create(path, SETTINGS):
+        raise ConfigError("a", 1, "is wrong")
+    assert [*tmp_path.rglob("*")] == [path] * was_there
+    with rundir.begun(path, "demo"):
+        pass
+    assert [*tmp_path.rglob("*")] == [path] * was_there
+
+
+def finish(path, began):
+    """Makes the directory of a finished run that began then, and was written now."""
+    with RunDirectory.create(path, SETTINGS):
+        content = json.loads((path / "config.json").read_text()) | {"began": began}
+    (path / "config.json").write_text(json.dumps(content))
+    (path / "summary.json").write_text("{}")
+    return path
+
+
+def test_a_copy_of_a_run_is_no_newer(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    old = finish(Path("runs/old"), "2026-11-23T19:00:25+00:00")
+    new = finish(Path("runs/new"), "2026-11-24T01:00:25+05:00")  # an hour later
+    assert rundir.newest(Path("latest")) == new
+    shutil.copytree(old, "runs/older")
+    shutil.copytree(new, "runs/newer")
+    assert rundir.newest(Path("latest")) == new
+    (new / "summary.json").unlink()
+    assert rundir.newest(Path("latest")) == Path("runs/newer")
+
+
+@pytest.mark.parametrize("began", [None, 3, "yesterday", "0001-01-01", "9" * 400, {}])
+def test_without_its_time_the_file_tells_when_a_run_began(tmp_path, monkeypatch, began):
+    monkeypatch.chdir(tmp_path)
+    for name, changed in (("second", 2.5e9), ("first", 1e9)):
+        os.utime(finish(Path("runs") / name, began) / "config.json", (changed, changed))
+    for name in ("nothing", "other"):
+        (tmp_path / "runs" / name).mkdir()
+    assert rundir.newest(Path("latest")) == Path("runs/second")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="has names of other letters")
+@pytest.mark.parametrize("name", [b"\xff", b"\x1b[2J", b"a\nb"])
+def test_a_name_that_a_terminal_would_obey_is_not_the_latest(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    plain = finish(Path("runs/plain"), "2026-11-23T19:00:25+00:00")
+    finish(Path("runs") / os.fsdecode(name), "2026-11-24T19:00:25+00:00")
+    assert rundir.newest(Path("latest")) == plain
+
+
+def test_a_run_that_cannot_be_written_is_not_resumed(tmp_path, monkeypatch):
+    with RunDirectory.create(tmp_path / "run", SETTINGS) as run:
+        run.append_metrics(stage="jmvae", step=1)
+
+    def refuse(*_, **__):
+        raise OSError(errno.EACCES, "Permission denied")  # as for a directory of mode 0555
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    with pytest.raises(files.WriteError, match="Permission denied"), RunDirectory.resume(run.path):
+        pytest.fail("it was resumed")
 
 
 def test_a_run_records_the_commit_of_its_source(tmp_path):

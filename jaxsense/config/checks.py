@@ -28,7 +28,9 @@ class ConfigError(ValueError):
     """Raised for an invalid setting; its message is `field = value: what would be right`."""
 
     def __init__(self, field: str, value: object, expected: str):
-        super().__init__(f"{field} = {_shown(value)}: {expected}")
+        text = f"{field} = {_shown(value)}: {expected}"
+        # It may quote a file, whose control characters a terminal would obey.
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
         self.expected = expected
 
     def __reduce__(self):

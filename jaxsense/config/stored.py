@@ -28,14 +28,16 @@ def from_plain(stored: object, base: Config | None = None) -> Config:
     return cast(Config, _made(Config, stored, base or Config(), ""))
 
 
-def parse_json(text: str) -> object:
-    """Parses JSON strictly: no deep nesting, no field twice.
+def parse_json(content: bytes) -> object:
+    """Parses JSON strictly: UTF-8, no deep nesting, no field twice, no half of a character.
 
     Raises:
-      ValueError: if the text is not JSON, is nested too deeply, or names a field twice.
+      ValueError: if the content is not such JSON.
     """
     try:
-        return json.loads(text, object_pairs_hook=_without_twins)
+        found = json.loads(content.decode(), object_pairs_hook=_without_twins)
+        json.dumps(found, ensure_ascii=False).encode()
+        return found
     except RecursionError:
         raise ValueError("nested too deeply") from None
 

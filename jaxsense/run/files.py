@@ -32,21 +32,11 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
     Raises:
       WriteError: if the file cannot be written; it is then unchanged.
     """
-    _write(path, (content.encode() if isinstance(content, str) else content,), mode)
-
-
-def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:
-    """Writes a file as `write` does, with the SHA-256 digest of its content before it."""
-    _write(path, (hashlib.sha256(content).digest(), content), mode)
-
-
-def _write(path: Path, parts: tuple[bytes, ...], mode: int) -> None:
-    """Writes a file of several parts, see `write`; to join them would copy them."""
     unfinished = _unfinished(path)
     try:
         unfinished.touch(mode, exist_ok=False)
         with unfinished.open("wb") as file:
-            file.writelines(parts)
+            file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
         unfinished.replace(path)
@@ -57,6 +47,11 @@ def _write(path: Path, parts: tuple[bytes, ...], mode: int) -> None:
     finally:
         with contextlib.suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Writes a file as `write` does, with the SHA-256 digest of its content before it."""
+    write(path, hashlib.sha256(content).digest() + content, mode)
 
 
 def is_unfinished(path: Path, name: str | None = None) -> bool:

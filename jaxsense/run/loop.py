@@ -176,6 +176,7 @@ class _Loop:
                 advance,
                 self._monitor,
                 self._checkpoints,
+                self._no_curves(stage),
             )
         except StageError as error:
             if not stage.is_optional:
@@ -210,7 +211,7 @@ class _Loop:
                 return None
             self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
         output = self._programs.of(stage).shapes.result().output
-        return self._checkpoints.load_or_forget(stage.name, output)
+        return self._checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
@@ -253,6 +254,7 @@ def run_chunks(
     run: Callable[[int, Output], tuple[Output, Curves]],
     monitor: Monitor,
     checkpoints: Checkpoints,
+    whole: Curves | None = None,
 ) -> tuple[Output, Curves]:
     """Runs a training from where it was last saved.
 
@@ -262,6 +264,7 @@ def run_chunks(
       run: `(chunk, state) -> (state, metrics)`, deterministic.
       monitor: asked whether to stop.
       checkpoints: where to save the training once a minute, and when it stops.
+      whole: see `Checkpoints.load_unfinished`.
 
     Returns:
       The last state and the metrics of all chunks.
@@ -271,7 +274,7 @@ def run_chunks(
       StageError: from `run`; the state before the chunk is saved.
     """
     done, curves = 0, Curves()
-    found = checkpoints.load_unfinished(stage.name, state)
+    found = checkpoints.load_unfinished(stage.name, state, stage.chunks, whole)
     if found is not None:
         done, state, curves = found
     saved = time.monotonic()

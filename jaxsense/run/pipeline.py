@@ -172,7 +172,7 @@ def play(
     cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
     found = player.play(mission_key(key), learned.models, played, episodes)
-    (checkpoints or Checkpoints()).forget_unfinished()
+    (checkpoints or Checkpoints()).forget_unfinished(stage.name for stage in programs.stages)
     block = summary.missions(player.mission, found.metrics)
     return Played(found.recording, found.naive, block)
 

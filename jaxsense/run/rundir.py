@@ -2,21 +2,25 @@
 
 import contextlib
 import functools
+import io
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import cast
 
 import jax
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, require_32_bits
+from jaxsense.config import Config, ConfigError, parse_json, require_32_bits
 from jaxsense.config.options import command
+from jaxsense.core import inside
 from jaxsense.models import Models
 from jaxsense.run import devices, files, version
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.settings import Settings, as_json, of_run, resumable
+from jaxsense.run.settings import Settings, as_json, began, of_run, resumable
 from jaxsense.summary.blocks import Made, Origin
 from jaxsense.summary.compare import UNKNOWN
 from jaxsense.summary.read import ORIGINS, read_made
@@ -25,6 +29,7 @@ from jaxsense.training import stages
 from jaxsense.training.agents import learner, tour_stages
 
 _METRICS = "metrics.jsonl"
+_MOST_METRICS, _MOST_METRICS_LINE = 2**28, 2**16  # bytes
 
 
 class RunDirectory:
@@ -44,31 +49,28 @@ class RunDirectory:
 
     @classmethod
     @contextlib.contextmanager
-    def create(cls, path: Path, settings: Settings) -> "Iterator[RunDirectory]":
+    def create(cls, path: Path | None, settings: Settings) -> "Iterator[RunDirectory]":
         """Makes the directory with its `config.json`, and locks it for this process.
 
-        If a `ConfigError` or Ctrl-C ends the run before anything else is written, the directory is
-        removed.
+        If a `ConfigError` or Ctrl-C ends the run before anything else is written, its files are
+        removed, and so is the directory if it is new.
 
         Args:
-          path: a new or empty directory.
+          path: a new or empty directory; by default `dated(settings.preset)`.
           settings: of the run.
 
         Raises:
           ConfigError: if the directory is not empty, cannot be written, or is locked by another
             process.
         """
-        content = as_json(settings)
         with contextlib.ExitStack() as kept:
+            path = kept.enter_context(begun(path, settings.preset))
             try:
-                path.mkdir(parents=True, exist_ok=True)
-                # Also before locking, which adds a file.
-                _check_empty(path)
                 kept.enter_context(_locked(path, "out"))
                 run = cls(path, settings)
                 run._remove_partial()
-                _check_empty(path)
-                write_json(path / "config.json", content)
+                _check_empty(path)  # once more: another process may have been faster
+                write_json(path / "config.json", as_json(settings))
             except OSError as error:
                 raise _unwritable(path, error) from None
             try:
@@ -95,7 +97,7 @@ class RunDirectory:
             run._remove_partial()
             run.checkpoints.check(is_begun=(path / _METRICS).exists())
             run._made = read_made(path)
-            if not run._made and run.checkpoints.exists():
+            if not run._made and (path / "checkpoints").exists():
                 run._made = [{**UNKNOWN, "stage": "earlier stages"}]
             run._read_metrics()
             yield run
@@ -129,31 +131,32 @@ class RunDirectory:
         return made
 
     def _remove_partial(self) -> None:
-        """Removes partial files of a killed process."""
-        for place in (self.path, *self.checkpoints.directories()):
-            files.remove_unfinished(place)
+        """Removes partial files of a killed process; raises `OSError` if a link leads elsewhere."""
+        for place in (self.path, self.path / "checkpoints", self.path / "checkpoints/unfinished"):
+            if inside.place(place, self.path).is_dir():
+                files.remove_unfinished(place)
 
     def _withdraw(self) -> None:
-        """Removes the directory if the run has written only its settings."""
+        """Empties the directory if the run has written only its settings."""
         ours = {".lock", "config.json"}
         with contextlib.suppress(OSError):
             if {path.name for path in self.path.iterdir()} <= ours:
                 for name in ours:
                     (self.path / name).unlink(missing_ok=True)
-                self.path.rmdir()
 
     def _read_metrics(self) -> None:
         """Reads the last step of each stage from `metrics.jsonl`, and cuts off a partial line."""
         path = self.path / _METRICS
-        if not path.exists():
+        if not os.path.lexists(path):
             return
-        content = path.read_bytes()
+        content = inside.read(path, _MOST_METRICS)
         whole = content[: content.rfind(b"\n") + 1]
-        if whole != content:
-            files.write(path, whole)
-        for line in whole.splitlines():
-            with contextlib.suppress(ValueError, KeyError, TypeError):
-                found = json.loads(line)
+        # Always, to find out at once whether the run can be written; and where the file is a link,
+        # lines go to a new one.
+        files.write(path, whole)
+        for line in io.BytesIO(whole):
+            with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
+                found = cast(dict, parse_json(line[:_MOST_METRICS_LINE]))
                 stage, step = found["stage"], int(found["step"])
                 self._reported[stage] = max(step, self._reported.get(stage, -1))
 
@@ -194,7 +197,7 @@ def dated(name: str) -> Path:
 
 @contextlib.contextmanager
 def begun(path: Path | None, name: str) -> Iterator[Path]:
-    """Makes a directory for other results than a run's, and removes it if it stays empty.
+    """Makes a directory, and removes it if it stays empty and was not there before.
 
     Args:
       path: a new or empty directory; by default `dated(name)`.
@@ -204,6 +207,7 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
       ConfigError: if the directory is not empty or cannot be made.
     """
     try:
+        is_new = path is None or not path.exists()
         path = path or dated(name)
         path.mkdir(parents=True, exist_ok=True)
         _check_empty(path)
@@ -213,7 +217,8 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
         yield path
     finally:
         with contextlib.suppress(OSError):
-            path.rmdir()
+            if is_new:
+                path.rmdir()
 
 
 def _unwritable(path: Path | None, error: OSError) -> ConfigError:
@@ -285,12 +290,12 @@ def newest(path: Path) -> Path:
         reason = f"must be the directory of a finished run; {PREFIX}{preset} only names models, "
         demo = f"{command('jaxsense.demo')} --preset {preset}"
         raise ConfigError("run", given, f"{reason}which {demo} plays")
-    configs = Path("runs").glob("*/config.json")
-    begun = {each.stat().st_mtime_ns: each.parent for each in configs}
-    finished = {time: run for time, run in begun.items() if (run / "summary.json").exists()}
+    runs = sorted(config.parent for config in Path("runs").glob("*/config.json"))
+    # Nobody could type the other names, and a terminal might obey them.
+    finished = [r for r in runs if r.name.isprintable() and (r / "summary.json").exists()]
     if not finished:
         raise ConfigError("run", "latest", "there is no finished run in runs/")
-    return finished[max(finished)]
+    return max(finished, key=began)
 
 
 def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
@@ -320,11 +325,11 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     checkpoints = Checkpoints(path / "checkpoints")
 
-    if not checkpoints.exists() and settings.num_seeds != 1:
+    if not (path / "checkpoints").exists() and settings.num_seeds != 1:
         raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
 
     def restore(name: str, shape: PyTree) -> PyTree:
-        found = checkpoints.load(name, shape)
+        found = checkpoints.load(name, shape, finite=True)
         if found is None:
             reason = f"must be a finished run (there is no checkpoint {name!r})"
             raise ConfigError("run", str(path), reason)

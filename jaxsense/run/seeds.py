@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsense.config import Config, ConfigError
+from jaxsense.core import inside
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings
@@ -36,10 +37,10 @@ def check_range(seed: int, number: int) -> None:
 
 
 def paths(run: RunDirectory) -> dict[int, Path]:
-    """The directory of each seed of a run."""
+    """The directory of each seed of a run; raises `OSError` if one leads out of it."""
     if run.settings.num_seeds == 1:
         return {run.settings.seed: run.path}
-    return {seed: run.path / f"seed-{seed}" for seed in run.settings.seeds}
+    return {n: inside.place(run.path / f"seed-{n}", run.path) for n in run.settings.seeds}
 
 
 def check(run: RunDirectory) -> None:
@@ -89,17 +90,17 @@ def rewards(
     Returns:
       `[K, epochs]` rewards as in `pipeline.Learned.rewards`, without those of such checkpoints.
     """
-    of_epochs = np.zeros(config.dqn.epochs, np.float32)
-    shapes = dict.fromkeys(("reward", "evaluation", "epsilon"), of_epochs)
-    shapes = {**shapes, "seconds": of_epochs[:: config.dqn.chunk]}
+    of_epochs, epochs = ("reward", "evaluation", "epsilon"), config.dqn.epochs
+    shapes = dict.fromkeys(of_epochs, np.zeros(epochs, np.float32))
+    shapes["seconds"] = np.zeros(epochs // config.dqn.chunk, np.float32)
 
     def load(run: Path, network: str) -> list[dict[str, np.ndarray]]:
         directory, name = run / "checkpoints", f"curves_{network}"
-        reason = f"{directory}: holds no {name}"
+        found, reason = None, f"{directory}: holds no {name}"
         try:
             found = Checkpoints(directory).load(name, shapes)
         except ConfigError as error:
-            found, reason = None, str(error)
+            reason = str(error)
         if found is None:
             warn(f"{reason}; left out of reward.svg")
         return [] if found is None else [found]

@@ -1,9 +1,10 @@
 """Settings of a run, and the `config.json` in which its directory keeps them."""
 
 import dataclasses
-import errno
 import hashlib
 import json
+import os
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias
 
@@ -16,6 +17,8 @@ from jaxsense.config import (
     parse_json,
     require_trust,
 )
+from jaxsense.config.checks import check_fields
+from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
 
 Json: TypeAlias = dict[str, object]
@@ -37,6 +40,9 @@ class Settings:
     config: Config
     num_seeds: int = 1
 
+    def __post_init__(self):
+        check_fields(self, bits=64)
+
     @property
     def seeds(self) -> range:
         """All seeds."""
@@ -52,7 +58,7 @@ class NotARunError(ConfigError):
 
 
 def as_json(settings: Settings) -> Json:
-    """The content of a `config.json`: settings, versions, and a digest of both."""
+    """The content of a `config.json`: settings, versions, the time, and a digest of all."""
     content: Json = {
         "preset": settings.preset,
         "seed": settings.seed,
@@ -60,8 +66,22 @@ def as_json(settings: Settings) -> Json:
         "config": as_plain(settings.config),
         "versions": versions(),
         "commit": commit(),
+        "began": datetime.now(UTC).isoformat(),
     }
     return {**content, "digest": _digest(content)}
+
+
+def began(path: Path) -> float:
+    """When a run began, in seconds since 1970, which a copy of its directory does not change.
+
+    Args:
+      path: its directory, with a `config.json`. If that does not tell, the time of its last change.
+    """
+    file = path / "config.json"
+    try:
+        return datetime.fromisoformat(str(_read_config(file, "run", path)["began"])).timestamp()
+    except (KeyError, ValueError, OverflowError):
+        return file.lstat().st_mtime
 
 
 def read_settings(file: Path, trust: bool = False) -> Settings:
@@ -91,26 +111,26 @@ def resumable(path: Path, trust: bool = False) -> Settings:
       ConfigError: if there is no run, if another version wrote it, if it is finished, or if it
         names custom sensors without trust.
     """
-    content = _read_config(path / "config.json", "resume", path)
-    _check_origin(content, "resume", path)
-    if (path / "summary.json").exists():
+    settings = of_run(path, trust, "resume")
+    if os.path.lexists(path / "summary.json"):
         raise ConfigError("resume", str(path), "is finished; must be a stopped run")
-    return _settings_of(content, trust)
+    return settings
 
 
-def of_run(path: Path, trust: bool = False) -> Settings:
+def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
     """Reads the settings of a run whose models are wanted.
 
     Args:
       path: the directory.
       trust: whether `config.json` may name custom sensors, whose code runs.
+      field: name of the option, for errors.
 
     Raises:
       ConfigError: if there is no run, if another version wrote it, or if it names custom sensors
         without trust.
     """
-    content = _read_config(path / "config.json", "run", path)
-    _check_origin(content, "run", path)
+    content = _read_config(path / "config.json", field, path)
+    _check_origin(content, field, path)
     return _settings_of(content, trust)
 
 
@@ -120,9 +140,9 @@ def _read_config(file: Path, field: str, path: Path) -> Json:
     Raises `ConfigError` about `field = path`, which is the file or its run's directory.
     """
     try:
-        if file.exists() and not (file.is_file() or file.is_dir()):
-            raise OSError(errno.EINVAL, "Not a regular file")  # a pipe might never end
-        content = parse_json(file.read_text(encoding="utf-8"))
+        # A file that the user names may be a link, that of a run may not lead out of it.
+        real = Path(os.path.realpath(file)) if path == file else file
+        content = parse_json(inside.read(real))
     except OSError as error:
         reason = f"{file.name} cannot be read ({error.strerror})"
         if path != file and isinstance(error, FileNotFoundError | NotADirectoryError):
@@ -137,25 +157,18 @@ def _read_config(file: Path, field: str, path: Path) -> Json:
 
 def _settings_of(content: Json, trust: bool) -> Settings:
     """The settings in a `config.json`; raises `ConfigError` if one is unknown or wrong."""
-    known = {"preset", "seed", "num_seeds", "config", "versions", "commit", "digest"}
+    known = {"preset", "seed", "num_seeds", "config", "versions", "commit", "began", "digest"}
     unknown = sorted(set(content) - known)
     if unknown:
         raise ConfigError(unknown[0], content[unknown[0]], "unknown field of a run's config.json")
     preset = content.get("preset", "default")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
-
-    def whole(name: str, default: int) -> int:
-        number = content.get(name, default)
-        if not isinstance(number, int) or isinstance(number, bool):
-            raise ConfigError(name, number, "must be a whole number")
-        return number
-
-    seed, num_seeds = whole("seed", 0), whole("num_seeds", 1)
     config = from_plain(content.get("config", {}), PRESETS[preset])
     if not trust:
         require_trust(config)
-    return Settings(preset, seed, config, num_seeds)
+    numbers = {name: content[name] for name in ("seed", "num_seeds") if name in content}
+    return Settings(**{"preset": preset, "seed": 0, "config": config, **numbers})
 
 
 def _digest(content: Json) -> str:
@@ -174,6 +187,6 @@ def _check_origin(content: Json, field: str, path: Path) -> None:
     if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
         by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
         raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")
-    if content.get("digest") not in (None, _digest(content)):
+    if content.get("digest") != _digest(content):
         reason = "config.json has changed since the run began; start a new run with --config"
         raise ConfigError(field, str(path), reason)

@@ -9,8 +9,6 @@ import jinja2
 
 from jaxsense.config.options import command
 
-_KINDS = {"svg": "svg+xml", "png": "png"}
-_SMIL = re.compile(r"<animate[^<>]*>")
 _SIZE = re.compile(r'viewBox="0 0 ([1-9]\d*) ([1-9]\d*)"')
 
 
@@ -35,8 +33,6 @@ def films(contents: Mapping[str, str]) -> Films:
     Args:
       contents: of their files, by the names of these without suffixes.
     """
-    # Films of earlier versions (SMIL) cannot be paused: what is left is their last frame.
-    contents = {name: _SMIL.sub("", content) for name, content in contents.items()}
     sizes = [_SIZE.search(content) for content in contents.values()]
     tall = max((int(size[2]) / (int(size[1]) / 2) for size in sizes if size), default=1.0)
     return Films(tuple(contents), render("films.html.jinja", films=contents), tall)
@@ -59,11 +55,6 @@ def render(template: str, **values: object) -> str:
     return environment.get_template(template).render(command=command, **values)
 
 
-def picture(kind: str, content: bytes) -> str:
-    """A picture as the source of an `img`, in which browsers run no scripts and load no files.
-
-    Args:
-      kind: `svg` or `png`.
-      content: of its file.
-    """
-    return f"data:image/{_KINDS[kind]};base64,{base64.b64encode(content).decode()}"
+def picture(content: bytes) -> str:
+    """An SVG as the source of an `img`, in which browsers run no scripts and load no files."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"

@@ -82,7 +82,7 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
     found = value if isinstance(value, dict) else difference
     match found:
         case {"mean": float(middle), "low": float(low), "high": float(high)}:
-            return [[middle - low], [high - middle]]
+            return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
     return None
 
 

@@ -1,5 +1,6 @@
 """The report of a run: one page that needs no other file."""
 
+import contextlib
 import json
 import operator
 import shlex
@@ -7,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from jaxsense.config import PRESETS, Config, as_plain
+from jaxsense.core import inside
 from jaxsense.show import html, tables
 from jaxsense.show.mission_plots import counted
 from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
@@ -32,11 +34,13 @@ def render(
       evaluations: further missions, by the names of their files.
 
     Raises:
-      OSError: if a picture cannot be read.
+      OSError: if a picture cannot be read, or they are too large.
+      ConfigError: if the summary is of other classes.
     """
     here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.svg")
+    plots = {path.stem: path for path in inside.matching(run, f"{EVALUATIONS}/*.svg")}
     elsewhere = [
-        _missions(_title(found, summary), found["mission"], run / EVALUATIONS / f"{name}.svg")
+        _missions(_title(found, summary), found["mission"], plots.get(name))
         for name, found in (evaluations or {}).items()
     ]
     return html.render(
@@ -77,8 +81,9 @@ def _order(config: Config) -> str:
 def _films(run: Path) -> list[html.Films]:
     """The films of a run, those of the same arena together, its own first."""
     found = {
-        path.stem: path.read_text(encoding="utf-8", errors="replace")
-        for path in sorted(run.glob("mission*.svg"), key=operator.attrgetter("stem"))
+        path.stem: inside.read(path).decode(errors="replace")
+        for path in sorted(inside.matching(run, "*.svg"), key=operator.attrgetter("stem"))
+        if path.name.startswith("mission")
     }
     own = {name: film for name, film in found.items() if name in OWN_FILMS}
     others = ({name: film} for name, film in found.items() if name not in own)
@@ -91,7 +96,7 @@ def _counted(devices: Sequence[str]) -> str:
     return ", ".join(f"{n} \u00d7 {kind}" if n > 1 else kind for kind, n in numbers.items())
 
 
-def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
+def _missions(title: str, missions: Missions, plot: Path | None) -> dict[str, object]:
     """Section of the page about missions in the same arenas."""
     played = cases(missions)
     number = max(mean(case["episodes"]) for case in played.values())
@@ -103,7 +108,7 @@ def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
         "tables": [table for table in found if table.rows],
         "details": tables.all_of_missions(missions),
         "sizes": compare.detection_sizes(missions),
-        "plot": _data(plot),
+        "plot": plot and _data(plot),
     }
 
 
@@ -119,13 +124,9 @@ def _title(found: Evaluation, summary: Summary) -> str:
 
 
 def _data(path: Path) -> str | None:
-    """A picture as a data URI; None if there is no such file.
-
-    Runs of earlier versions have plots as PNG files.
-    """
-    for each in (path, path.with_suffix(".png")):
-        if each.exists():
-            return html.picture(each.suffix[1:], each.read_bytes())
+    """A picture as a data URI; None if there is no such file."""
+    with contextlib.suppress(FileNotFoundError):
+        return html.picture(inside.read(path))
     return None
 
 

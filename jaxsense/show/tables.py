@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import cast
 
+from jaxsense.config import ConfigError
 from jaxsense.mission import is_fault
 from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
 from jaxsense.summary.blocks import (
@@ -125,9 +126,15 @@ def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
 
     Returns:
       A row for each class: the result here, and the paper's if it has the same classes and sensors.
+
+    Raises:
+      ConfigError: if the results are of other classes.
     """
     block = results["jmvae"]
     columns = sorted(block["unambiguous"], key="joint".__eq__)
+    blocks = block["unambiguous"], block["sigma_norm"], block["consistent"]
+    if {len(each.get(name, ())) for each in blocks for name in columns} - {len(classes)}:
+        raise ConfigError("jmvae", columns, f"must each have a value for {len(classes)} classes")
     is_paper = set(classes) == _PAPER_CLASSES and set(columns) == {"camera", "lidar", "joint"}
 
     def cell(c: int, name: str) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from jaxsense.config import ConfigError
+from jaxsense.core import inside
 
 
 def require() -> None:
@@ -21,10 +22,10 @@ def require() -> None:
 
 
 def make_writer(path: Path) -> Callable[..., None]:
-    """Returns a function that writes reported metrics to event files in a directory."""
+    """Returns a function that writes reported metrics to event files in a directory of a run."""
     from tensorboardX import SummaryWriter  # noqa: PLC0415 (an optional dependency)
 
-    writer = SummaryWriter(str(path))
+    writer = SummaryWriter(str(inside.place(path, path.parent)))
 
     def write(*, stage: str, step: int, **metrics: float) -> None:
         for name, value in metrics.items():

@@ -292,7 +292,7 @@ class Traffic(TypedDict):
     raw: Annotated[float, Metric("bytes of a scan", "Mean size of a detection's scan.", 0)]
 
 
-_TRAFFIC = "bytes_per_detection"
+TRAFFIC = "bytes_per_detection"
 Missions = dict[str, Case | Traffic]
 """`mission`: a `Case` for each policy, and `bytes_per_detection`."""
 
@@ -355,15 +355,19 @@ class Header(Origin):
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 
 
-class Summary(Header, Results):
-    """The whole file."""
+class Timed(Header):
+    """The keys of a summary that are not results."""
 
     timing: Timing
 
 
+class Summary(Timed, Results):
+    """The whole file."""
+
+
 def cases(missions: Missions) -> dict[str, Case]:
     """The cases of a block `mission`, by name."""
-    return {name: cast(Case, case) for name, case in missions.items() if name != _TRAFFIC}
+    return {name: cast(Case, case) for name, case in missions.items() if name != TRAFFIC}
 
 
 def policies(missions: Missions) -> dict[str, Case]:
@@ -373,7 +377,7 @@ def policies(missions: Missions) -> dict[str, Case]:
 
 def traffic(missions: Missions) -> Traffic:
     """The bytes of a detection in a block `mission`."""
-    return cast(Traffic, missions[_TRAFFIC])
+    return cast(Traffic, missions[TRAFFIC])
 
 
 def _metrics(block: type, prefix: str = "") -> Iterator[Metric]:
@@ -401,7 +405,7 @@ BLOCKS = {
     "belief.": BELIEF,
     "dqn.MODALITY.": AGENTS,
     "mission.POLICY.": MISSIONS,
-    f"mission.{_TRAFFIC}.": _table(Traffic),
+    f"mission.{TRAFFIC}.": _table(Traffic),
     "evaluations.NAME.": _table(Evaluation),
 }
 """All metrics, by the prefix of their key in `summary.json` and then by the rest of it. Evaluations

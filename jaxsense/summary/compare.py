@@ -68,7 +68,7 @@ def at_most(number: int) -> float:
     Args:
       number: of trials, taken as independent.
     """
-    return 1 - (1 - _CONFIDENCE) ** (1 / number)
+    return 1 - (1 - _CONFIDENCE) ** (1 / number) if number > 0 else 1.0
 
 
 def differences(found: Measured, reference: Measured) -> Differences:

@@ -1,6 +1,7 @@
 """Reads and checks `summary.json` and the evaluations of the same run."""
 
 import json
+import os
 import shlex
 import types
 from pathlib import Path
@@ -9,12 +10,16 @@ from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError, parse_json
 from jaxsense.config.options import command
-from jaxsense.summary.blocks import Evaluation, Made, Results, Summary
+from jaxsense.core import inside
+from jaxsense.summary import blocks
+from jaxsense.summary.blocks import Evaluation, Made, Missions, Results, Summary, Timed
+from jaxsense.summary.metrics import Interval
 
 ORIGINS = "origins.json"
 EVALUATIONS = "evaluations"
 """The directory of evaluations in that of a run."""
 RESULTS = tuple(get_type_hints(Results))
+_MOST_CASES, _LARGEST = 1000, 1e30
 
 
 def read(run: Path) -> Summary:
@@ -40,8 +45,9 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
 
     Raises:
       ConfigError: if one cannot be read, or a value in it is missing or wrong.
+      OSError: see `inside.matching`.
     """
-    files = sorted((run / EVALUATIONS).glob("*.json"))
+    files = inside.matching(run, f"{EVALUATIONS}/*.json")
     return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
 
 
@@ -71,16 +77,16 @@ class NotFinishedError(ConfigError):
 
 
 def _read(run: Path, file: Path, kind: type) -> object:
-    if kind is Summary and not file.exists():
+    if kind is Summary and not os.path.lexists(file):
         raise NotFinishedError(run)
     try:
-        content = parse_json(file.read_text(encoding="utf-8"))
+        content = parse_json(inside.read(file))
         json.dumps(content, allow_nan=False)
-        # With several seeds, only the summary of each seed has this type.
-        values = content
-        if isinstance(content, dict) and "seeds" in content:
-            values, kind = content["seeds"], dict[str, Results]
-        if wrong := _wrong(values, kind, file.stem):
+        wrong = _wrong(content, kind, file.stem)
+        # With several seeds, only the results of each seed have this type.
+        if kind is Summary and isinstance(content, dict) and content.get("seeds"):
+            wrong = _wrong(content, Timed, "summary") or _wrong(content, Results, "summary", True)
+        if wrong:
             raise ValueError(wrong)
         return content
     except (OSError, ValueError) as error:
@@ -88,20 +94,28 @@ def _read(run: Path, file: Path, kind: type) -> object:
         raise ConfigError("run", str(run), reason) from None
 
 
-def _wrong(value: object, kind: type, key: str) -> str | None:
-    """The first JSON value that is missing or not of its type; None if all are."""
+def _wrong(value: object, kind: type, key: str, is_mean: bool = False) -> str | None:
+    """The first JSON value that is missing or not of its type; None if all are.
+
+    Means of several seeds have an `Interval` in place of each number.
+    """
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (Annotated, NotRequired):
-        return _wrong(value, inner[0], key)
+        return _wrong(value, inner[0], key, is_mean)
     if origin in (Union, types.UnionType):
-        found = [_wrong(value, each, key) for each in inner]
+        found = [_wrong(value, each, key, is_mean) for each in inner]
         return None if None in found else found[0]
+    if is_mean and kind in (int, float, bool):
+        kind, is_mean = Interval, False
     if is_block(kind) and isinstance(value, dict):
         hints = get_type_hints(kind, include_extras=True)
         if missing := sorted(kind.__required_keys__ - set(value)):
             return f"{key}.{missing[0]} is missing"
         items = [(name, value[name], hints[name]) for name in hints if name in value]
-    elif origin is dict and isinstance(value, dict):
+    elif kind == Missions and isinstance(value, dict) and 1 < len(value) <= _MOST_CASES:
+        kinds = {**dict.fromkeys(value, blocks.Case), blocks.TRAFFIC: blocks.Traffic}
+        items = [(name, value.get(name), each) for name, each in kinds.items()]
+    elif origin is dict and kind != Missions and isinstance(value, dict):
         items = [(name, each, inner[1]) for name, each in value.items()]
     elif origin is list and isinstance(value, list):
         items = [(str(i), each, inner[0]) for i, each in enumerate(value)]
@@ -109,6 +123,7 @@ def _wrong(value: object, kind: type, key: str) -> str | None:
         kinds = (int, float) if kind is float else kind
         is_right = not (is_block(kind) or origin) and isinstance(value, kinds)
         is_right &= kind is bool or not isinstance(value, bool)
+        is_right &= not isinstance(value, int | float) or abs(value) <= _LARGEST
         return None if is_right else f"{key} has the wrong type"
-    found = (_wrong(each, hint, f"{key}.{name}") for name, each, hint in items)
+    found = (_wrong(each, hint, f"{key}.{name}", is_mean) for name, each, hint in items)
     return next((wrong for wrong in found if wrong), None)

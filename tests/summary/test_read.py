@@ -32,7 +32,7 @@ def test_a_summary_is_read_with_keys_of_later_versions(tmp_path):
         ("mission.bytes_per_detection", 3, "bytes_per_detection has the wrong type"),
         ("jmvae.unambiguous.joint", [1], "summary.jmvae.unambiguous.joint.0 has the wrong type"),
         ("belief", [], "summary.belief has the wrong type"),
-        ("seeds", {"3": {}}, "summary.3.belief is missing"),
+        ("seeds", {"3": {}}, "summary.seeds.3.belief is missing"),
     ],
 )
 def test_what_is_missing_or_wrong_is_named(tmp_path, place, value, reason):

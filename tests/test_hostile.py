@@ -1,0 +1,366 @@
+"""Run directories that somebody has prepared: nothing hangs, nothing outside is touched."""
+
+import contextlib
+import functools
+import hashlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from flax import serialization
+from smoke import save_models
+from summaries import CASE, EVALUATION, RESULTS, SUMMARY
+
+import jaxsense
+from jaxsense import evaluate, models, summary
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.core import inside
+from jaxsense.run import seeds
+from jaxsense.run.checkpoints import Unfinished
+from jaxsense.run.rundir import RunDirectory
+from jaxsense.run.settings import Settings
+from jaxsense.show import tensorboard
+from jaxsense.summary import statistics
+
+FEWER = SUMMARY["jmvae"] | {"unambiguous": {"joint": [True]}}
+BLOCKS = {name: SUMMARY[name] for name in RESULTS}
+OF_SEEDS = {**statistics.statistics([BLOCKS, BLOCKS]), "seeds": {"3": BLOCKS, "4": BLOCKS}}
+DEEP = '{"a": ' * 100_000 + "1" + "}" * 100_000
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="has no FIFO, and no links for everybody"),
+    pytest.mark.timeout(120),
+]
+
+CONFIG = PRESETS["smoke"]
+STATE = {"w": np.ones(3, np.float32)}
+SPARSE = 2**30  # bytes
+CHUNKS = 4
+WHOLE = {"loss": [0.0] * 10, "seconds": [0.0] * CHUNKS}  # chunks of 3, 3, 3 and 1
+
+
+@functools.cache
+def shapes():
+    return jax.eval_shape(lambda: models.init(jax.random.key(0), CONFIG))
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """A finished run that nobody has trained, with all its files, stopped in a training."""
+    path = tmp_path_factory.mktemp("base") / "run"
+    with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as run:
+        save_models(run, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes()))
+        curves = {"loss": [1.0] * 6, "seconds": [0.1] * 2}
+        run.checkpoints.save_unfinished("dqn_camera", Unfinished(2, STATE, curves))
+        run.append_metrics(stage="jmvae", step=1, loss=0.5)
+    (path / "summary.json").write_text(json.dumps(SUMMARY))
+    (path / "evaluations").mkdir()
+    (path / "evaluations" / "there.json").write_text(json.dumps(EVALUATION))
+    for name in ("reward.svg", "mission.svg", "evaluations/there.svg"):
+        (path / name).write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 8 4"/>')
+    return path
+
+
+def outcome(function, *args):
+    """What a reader says: its one line, or nothing if it found no fault."""
+    try:
+        function(*args)
+    except (ConfigError, OSError) as error:
+        return str(error)
+    return ""
+
+
+def resume(path):
+    """What a resumed run does with its directory until it has finished."""
+    file = path / "summary.json"
+    shutil.rmtree(file) if file.is_dir() else file.unlink()
+    with RunDirectory.resume(path) as run:
+        run.checkpoints.load_or_forget("best_jmvae", shapes().jmvae, finite=True)
+        run.checkpoints.load_unfinished("dqn_camera", STATE, CHUNKS, WHOLE)
+        run.checkpoints.save_unfinished("dqn_camera", Unfinished(1, STATE, WHOLE))
+        run.append_metrics(stage="jmvae", step=2, loss=0.5)
+        run.checkpoints.forget_unfinished(["dqn_camera"])
+
+
+def everything(path):
+    """All files and directories there, with their content."""
+    return {
+        each.relative_to(path): each.read_bytes() if each.is_file() else None
+        for each in sorted(path.rglob("*"))
+    }
+
+
+def put(name, content):
+    """Another content of a file."""
+
+    def change(run, outside):
+        file = run / name
+        file.parent.mkdir(exist_ok=True, parents=True)
+        file.unlink(missing_ok=True)
+        file.write_bytes(content.encode() if isinstance(content, str) else content)
+
+    return change
+
+
+def fifo(name):
+    def change(run, outside):
+        (run / name).unlink(missing_ok=True)
+        os.mkfifo(run / name)
+
+    return change
+
+
+def sparse(name):
+    def change(run, outside):
+        with (run / name).open("wb") as file:
+            file.truncate(SPARSE)
+
+    return change
+
+
+def link(name, target="secret"):
+    """A link in place of a file or directory, to one outside, relative or absolute."""
+
+    def change(run, outside):
+        path = run / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        path.symlink_to(outside / target)
+
+    return change
+
+
+def hard_link(name):
+    def change(run, outside):
+        (run / name).unlink(missing_ok=True)
+        (run / name).hardlink_to(outside / "secret")
+
+    return change
+
+
+def directory(name):
+    def change(run, outside):
+        (run / name).unlink()
+        (run / name / "inner").mkdir(parents=True)
+
+    return change
+
+
+def digested(name, content):
+    """A checkpoint with a right digest."""
+    if not isinstance(content, bytes):
+        content = serialization.msgpack_serialize(content)
+    return put(f"checkpoints/{name}.msgpack", hashlib.sha256(content).digest() + content)
+
+
+def unfinished(**changed):
+    """The training under way, of which some parts are others."""
+    found = {"done": 2, "state": STATE, "curves": {"loss": np.ones(6), "seconds": np.ones(2)}}
+    return digested("unfinished/dqn_camera", found | changed)
+
+
+def edited(name, **changed):
+    """A JSON file of which some keys have other values."""
+
+    def change(run, outside):
+        content = json.loads((run / name).read_text())
+        (run / name).write_text(json.dumps(content | changed))
+
+    return change
+
+
+def listed(*names):
+    """A list of checkpoints with other names, for which files outside exist."""
+
+    def change(run, outside):
+        digested("saved", [name.format(outside=outside) for name in names])(run, outside)
+
+    return change
+
+
+def poisoned(run, outside):
+    """NaN in a file whose digest is right."""
+    file = run / "checkpoints" / "best_jmvae.msgpack"
+    content = bytearray(file.read_bytes()[32:])
+    content[-8:] = np.float32([np.nan, np.nan]).tobytes()
+    digested("best_jmvae", bytes(content))(run, outside)
+
+
+def without_digest(run, outside):
+    content = json.loads((run / "config.json").read_text())
+    del content["digest"]
+    content["seed"] = 7
+    (run / "config.json").write_text(json.dumps(content))
+
+
+NAMES = (
+    *("config.json", "summary.json", "metrics.jsonl", "mission.svg", "reward.svg"),
+    *("evaluations/there.json", "checkpoints/best_jmvae.msgpack", "checkpoints/saved.msgpack"),
+)
+DAMAGED = "is damaged or of other settings"
+OTHERS, NOT_NUMBERS = f"{DAMAGED} (it holds other arrays)", "numbers that are not finite"
+WRONG = "must hold the summary.json of a finished run"
+# What somebody has done, and what a reader must say of it; nothing where it may be overlooked.
+CASES = {
+    **{f"fifo {name}": (fifo(name), "Not a regular file") for name in NAMES},
+    "fifo .lock": (fifo(".lock"), ""),
+    **{f"link {name}": (link(name), "Leads out of its directory") for name in NAMES},
+    **{
+        f"link {name}/": (link(name, "folder"), "Leads out of its directory")
+        for name in ("checkpoints", "checkpoints/unfinished", "evaluations")
+    },
+    "link .lock": (link(".lock"), "symbolic link"),
+    "link to nothing": (link("summary.json", "nothing"), "Leads out of its directory"),
+    "hard link": (hard_link("metrics.jsonl"), ""),
+    **{f"sparse {name}": (sparse(name), "Larger than") for name in NAMES},
+    **{
+        f"directory {name}": (directory(name), "Is a directory")
+        for name in NAMES
+        if name != "reward.svg"
+    },
+    "names ../": (listed("../../outside/none", "../../outside/model"), "none.msgpack': is missing"),
+    "names absolute": (listed("{outside}/none", "{outside}/model"), "none.msgpack': is missing"),
+    "names unfinished/../": (listed("unfinished/../../../../outside/model"), ""),
+    "names not texts": (digested("saved", [1, 2.5]), DAMAGED),
+    "names nested": (digested("saved", [[["best_jmvae"]]]), DAMAGED),
+    "names many": (digested("saved", [str(i) for i in range(5000)]), DAMAGED),
+    "model text": (digested("best_jmvae", "text"), OTHERS),
+    "model list": (digested("best_jmvae", [1, 2]), OTHERS),
+    "model number": (digested("best_jmvae", 3), OTHERS),
+    "model keys": (digested("best_jmvae", b"\x82\x01\x02\xa1a\x03"), DAMAGED),
+    "model deep": (digested("best_jmvae", b"\x81\xa1a" * 1000 + b"\x01"), DAMAGED),
+    "model of 2^32 items": (digested("best_jmvae", b"\xdd\xff\xff\xff\xff"), DAMAGED),
+    "model no msgpack": (digested("best_jmvae", b"\xc1"), DAMAGED),
+    "model chunks": (digested("best_jmvae", {"__msgpack_chunked_array__": True}), DAMAGED),
+    "model NaN": (poisoned, NOT_NUMBERS),
+    "done 1e9": (unfinished(done=10**9), "done = 1000000000: must be from 0 to 4"),
+    "done -5": (unfinished(done=-5), "done = -5: must be from 0 to 4"),
+    "done text": (unfinished(done="two"), DAMAGED),
+    "curves none": (unfinished(curves={}), "its curves have other names or lengths"),
+    "curves longer": (
+        unfinished(curves={"loss": np.ones(7), "seconds": np.ones(2)}),
+        "its curves have other names or lengths",
+    ),
+    "curves list": (unfinished(curves=[1]), DAMAGED),
+    "state": (unfinished(state={"w": np.ones(4, np.float32)}), "in place of float32(3,)"),
+    "no digest": (without_digest, "config.json has changed since the run began"),
+    "config deep": (put("config.json", DEEP), "nested too deeply"),
+    "config list": (put("config.json", "[1]"), "must hold an object"),
+    "escapes": (edited("config.json", versions={"jaxsense": "\x1b[2J\n"}), r"jaxsense \x1b[2J\n; "),
+    "metrics": (put("metrics.jsonl", '{"stage": "a", "step": Infinity}\n[1]\n'), ""),
+    "metrics keys": (put("metrics.jsonl", '{"stage": [], "step": 1}\n{"stage": "a"}\n'), ""),
+    "metrics deep": (put("metrics.jsonl", DEEP + "\n"), ""),
+    "metrics long": (put("metrics.jsonl", "[" * 2**22 + "\n"), ""),
+    "summary deep": (put("summary.json", DEEP), "nested too deeply"),
+    "summary Infinity": (edited("summary.json", later=float("inf")), WRONG),
+    "summary of no seeds": (edited("summary.json", seeds={}), ""),
+    "summary of one seed": (edited("summary.json", seeds={"3": SUMMARY}), WRONG),
+    "summary of seeds": (edited("summary.json", **OF_SEEDS), "holds several seeds; choose one"),
+    "failed": (edited("summary.json", failed=[1]), "summary.failed has the wrong type"),
+    "no mission": (edited("summary.json", mission={}), "summary.mission has the wrong type"),
+    "no traffic": (edited("summary.json", mission={"a": CASE, "b": CASE}), "bytes_per_detection"),
+    "many cases": (edited("summary.json", mission={str(i): CASE for i in range(2000)}), WRONG),
+    "huge number": (edited("summary.json", seed=10**400), "summary.seed has the wrong type"),
+    "surrogate": (edited("summary.json", preset="\ud800"), "surrogates not allowed"),
+    "other classes": (edited("summary.json", jmvae=FEWER), "must each have a value for 3 classes"),
+    "no PoIs": (edited("evaluations/there.json", num_pois=0), ""),
+    "evaluation": (edited("evaluations/there.json", mission={}), "there.mission has the wrong"),
+    "film": (put("mission.svg", b"\xff\xfe\x00" * 1000), ""),
+    "film not printable": (put("mission\x1b.svg", "<svg/>"), ""),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_directory_that_somebody_has_prepared(name, base, tmp_path):
+    run, outside = tmp_path / "runs" / "run", tmp_path / "outside"
+    shutil.copytree(base, run)
+    (outside / "folder").mkdir(parents=True)
+    for secret in ("secret", "model.msgpack", "folder/model.msgpack", "folder/there.json"):
+        (outside / secret).write_text("precious")
+    change, expected = CASES[name]
+    change(run, outside)
+    before, warned = everything(outside), io.StringIO()
+    said = [outcome(jaxsense.load, run), outcome(evaluate._report, run, CONFIG)]
+    with contextlib.redirect_stderr(warned):
+        said.append(outcome(resume, run))
+    said += warned.getvalue().splitlines()
+    assert any(expected in line for line in said), said
+    assert expected or not any(said), said
+    assert everything(outside) == before
+    assert all(line.isprintable() for line in said)
+
+
+def test_the_directory_itself_is_sound(base, tmp_path, capsys):
+    """Nothing is said about what nobody has changed."""
+    shutil.copytree(base, tmp_path / "run")
+    assert jaxsense.load(tmp_path / "run")[0] == CONFIG
+    assert summary.read(tmp_path / "run") == SUMMARY
+    evaluate._report(tmp_path / "run", CONFIG)
+    resume(tmp_path / "run")
+    assert capsys.readouterr().err == ""
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["step"] for line in lines] == [1, 2]
+    assert not (tmp_path / "run" / "checkpoints" / "unfinished").exists()
+
+
+@pytest.mark.parametrize("name", ["seed-1", "tensorboard"])
+def test_other_directories_of_a_run_stay_in_it(tmp_path, name):
+    (tmp_path / "outside").mkdir()
+    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, CONFIG, num_seeds=2)) as run:
+        (run.path / name).symlink_to(tmp_path / "outside")
+        opens = (
+            (lambda: seeds.paths(run))
+            if name == "seed-1"
+            else (lambda: tensorboard.make_writer(run.path / name))
+        )
+        with pytest.raises(OSError, match="Leads out of its directory"):
+            opens()
+    assert not [*(tmp_path / "outside").iterdir()]
+
+
+PAGE = """
+import resource, sys
+from pathlib import Path
+from jaxsense import evaluate
+from jaxsense.config import PRESETS
+evaluate._report(Path(sys.argv[1]), PRESETS["smoke"])
+print(0, 0, False, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20)
+"""
+PEAK = """
+import resource, subprocess, sys
+done = subprocess.run([sys.executable, "-m", *sys.argv[1:]], capture_output=True, text=True)
+peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
+print(done.returncode, len(done.stderr.splitlines()), "Traceback" in done.stderr, peak)
+"""
+
+
+LARGEST = inside.LARGEST - 100_000
+LARGE = {
+    **{name: change for name, (change, _) in CASES.items() if name.startswith("sparse")},
+    "lists": put("summary.json", f"[{'[],' * (LARGEST // 3)}[]]"),
+    "quotes": put("mission.svg", '"' * LARGEST),
+}
+del LARGE["sparse checkpoints/saved.msgpack"]  # resumes and trains
+
+
+@pytest.mark.slow  # imports JAX for each
+@pytest.mark.parametrize("name", LARGE)
+def test_a_command_takes_no_more_than_a_gigabyte(name, base, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(base, run)
+    LARGE[name](run, tmp_path)
+    command = [sys.executable, "-c", PEAK, "jaxsense.evaluate", "--policy", "naive", str(run)]
+    if "metrics" in name:
+        (run / "summary.json").unlink()
+        command[3:] = ["jaxsense.train", "--resume", str(run)]
+    if name == "quotes":  # they are shown
+        command[2:] = [PAGE, str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+    status, lines, is_traceback, peak = done.stdout.split()
+    expected = ("0", "0") if name == "quotes" else ("2", "1")
+    assert ((status, lines), is_traceback) == (expected, "False")
+    assert float(peak) < 1  # GiB
