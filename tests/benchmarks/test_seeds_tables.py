@@ -148,7 +148,7 @@ def test_policies_stand_by_the_learned_one_with_all_seeds(runs):
 
 
 def test_evaluations_of_one_run_are_by_one_commit(runs):
-    mission = {"latent": CASE}
+    mission = {"latent": CASE, "bytes_per_detection": BYTES}
     other = {
         **EVALUATION,
         "mission": mission,
@@ -161,7 +161,7 @@ def test_evaluations_of_one_run_are_by_one_commit(runs):
 
 def test_teams_of_other_sizes_are_other_columns(runs):
     def evaluation(robots, accuracy):
-        mission = {"latent": {**CASE, "accuracy": accuracy}}
+        mission = {"latent": {**CASE, "accuracy": accuracy}, "bytes_per_detection": BYTES}
         return {**EVALUATION, "num_pois": 8, "robots": robots, "mission": mission}
 
     two, three = ["camera", "lidar"], ["camera", "camera", "lidar"]
@@ -176,6 +176,7 @@ def test_teams_of_other_sizes_are_other_columns(runs):
 
 def test_robots_that_fail_stand_below_those_that_work(runs):
     cases = {"latent": CASE, "auction": CASE, "camera_alone": {**CASE, "accuracy": 0.7}}
+    cases["bytes_per_detection"] = BYTES
     run = runs("default", 100, a={**EVALUATION, "num_pois": 3, "mission": cases})
     table = tables.failures(gather([run]), "default", 3, 3)
     assert cells(table, "all work") == ["0.998", "1.68", "13.8 s", "14.5 s", "0"]
