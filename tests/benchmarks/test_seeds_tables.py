@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from summaries import CASE, EVALUATION, GROUPED, OF_SCANS, SUMMARY
+from summaries import BYTES, CASE, EVALUATION, GROUPED, OF_SCANS, SUMMARY
 
 from benchmarks.seeds import __main__ as program
 from benchmarks.seeds import rows, tables
