@@ -315,6 +315,10 @@ FUNCTIONS = {
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
         "classes = 7: must be a whole number from 0 to 2",
     ),
+    "make_layout few": (
+        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), w.classes[:2]),
+        "classes has the shape (2,): must be (3,)",
+    ),
     "make_layout dtype": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD * 1.0),
         "classes of dtype float32: must be a whole number",

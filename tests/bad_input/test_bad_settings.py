@@ -578,3 +578,8 @@ def test_64_bits_are_refused_in_one_line(tmp_path):
     (line,) = (done.stdout + done.stderr).splitlines()
     assert NO_64_BITS in line
     assert not list(tmp_path.iterdir())
+
+
+def test_an_error_shows_control_characters_and_leaves_text_as_it_is():
+    found = str(ConfigError("run", "a", "holds \x1b[2J\n of mission-2"))
+    assert found == "run = 'a': holds \\x1b[2J\\n of mission-2"
