@@ -50,6 +50,26 @@ def test_an_import_takes_no_longer_than_what_it_needs(names, absent):
     assert found & absent == set()
 
 
+def folded_and_used(function):
+    """Names of keys that a function folds numbers into, and also hands to something else."""
+    calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+    pairs = [
+        (ast.unparse(call.func), a.id) for call in calls for a in call.args if hasattr(a, "id")
+    ]
+    folded = {name for called, name in pairs if called.endswith("random.fold_in")}
+    used = {name for called, name in pairs if not called.endswith(("fold_in", "require_key"))}
+    return (folded & used) - {node.func.id for node in calls if hasattr(node.func, "id")}
+
+
+def test_a_key_into_which_a_number_is_folded_is_used_for_nothing_else():
+    # JAX's own checker, `jax_debug_key_reuse`, lets this pass. `split(key)[i] == fold_in(key, i)`.
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                keys = {name for name in folded_and_used(node) if "key" in name}
+                assert not keys, f"{path}: {node.name}"
+
+
 def test_every_name_of_the_package_is_there():
     assert {"learn", "load", "PRESETS", "sim", "Models"} <= set(jaxsense.__all__)
     assert all(hasattr(jaxsense, name) for name in jaxsense.__all__)

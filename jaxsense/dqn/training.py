@@ -5,7 +5,7 @@ Random numbers are drawn once for a whole chunk of epochs: in the loop they woul
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
 import jax
@@ -178,7 +178,8 @@ def train_chunk(
     for part in jax.tree.leaves(prepared):
         checks.require_shape("prepared", part, (config.num_starts, ...))
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
-    draws = _draw(key, config)
+    *draw_keys, evaluation_key = jax.random.split(key, 4)
+    draws = _draw(draw_keys, config)
     epoch = functools.partial(_epoch, environment, config, shares)
     if evaluate is None:
         return jax.lax.scan(epoch, state, draws)
@@ -190,16 +191,15 @@ def train_chunk(
         found = jnp.full(every, jnp.nan).at[-1].set(evaluate(key, state.params))
         return state, dataclasses.replace(infos, evaluation_return=found)
 
-    # `_draw` splits the key itself in three, as without evaluation.
-    keys = jax.random.split(jax.random.fold_in(key, 3), config.chunk // every)
+    keys = jax.random.split(evaluation_key, config.chunk // every)
     groups = jax.tree.map(lambda x: x.reshape(-1, every, *x.shape[1:]), draws)
     state, infos = jax.lax.scan(advance, state, (keys, groups))
     return state, jax.tree.map(lambda x: x.reshape(-1), infos)
 
 
-def _draw(key: Key, config: DqnConfig) -> _Draws:
+def _draw(keys: Sequence[Key], config: DqnConfig) -> _Draws:
     """Random numbers of `[chunk]` epochs."""
-    env_key, step_key, replay_key = jax.random.split(key, 3)
+    env_key, step_key, replay_key = keys
     shape, blocks = (config.chunk, config.num_envs), config.batch // config.block
     coin, action, start = jax.random.uniform(env_key, (3, *shape))
     return _Draws(

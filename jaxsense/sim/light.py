@@ -96,10 +96,10 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
       has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
     """
     checks.require_key(key)
-    side, height, diffuse, ambient = jax.random.uniform(key, (4,))
+    light_key, condition_key = jax.random.split(key)
+    side, height, diffuse, ambient = jax.random.uniform(light_key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
     flat = jnp.cos(height)
     direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])
-    # Folded in: the light must not depend on what is switched on.
-    conditions = random_conditions(jax.random.fold_in(key, 1)) if has_conditions else None
+    conditions = random_conditions(condition_key) if has_conditions else None
     return Light(direction, 0.2 + 0.6 * diffuse, 0.3 + 0.3 * ambient, conditions)

@@ -139,11 +139,10 @@ def look(
     checks.require_shape("poi", poi, ())
     checks.require_index("poi", poi, world.arena.config.num_pois)
     checks.require_finite("scene.poses", scene.poses)
-    viewpoint_key, noise_key = jax.random.split(key)
+    viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
-    error_key, position = jax.random.fold_in(key, 2), scene.layout.position[poi]
-    bearing, _ = _believed(error_key, world, pose, bearing, position)
+    bearing, _ = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
@@ -176,7 +175,7 @@ def look_again(
     """
     checks.require_shape("poi", poi, ())
     checks.require_index("poi", poi, world.arena.config.num_pois)
-    distance_key, viewpoint_key, noise_key = jax.random.split(key, 3)
+    distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
     pose, bearing = viewpoints.moved_viewpoint(
         viewpoint_key,
         world.viewpoint,
@@ -187,8 +186,7 @@ def look_again(
         scene.poses[robot, :2],
         farthest * jax.random.uniform(distance_key) ** 3,
     )
-    error_key, position = jax.random.fold_in(key, 3), scene.layout.position[poi]
-    bearing, _ = _believed(error_key, world, pose, bearing, position)
+    bearing, _ = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
@@ -258,8 +256,8 @@ def survey(
 
     def stand(key: Key, robot: jax.Array, poi: jax.Array) -> tuple[View, mjx.Data]:
         standing = others(scene.poses, robot)
-        pose, bearing = _viewpoint(key, world, scene.layout, standing, poi)
-        error_key = jax.random.fold_in(key, 2)
+        pose_key, error_key, absent_key = jax.random.split(key, 3)
+        pose, bearing = _viewpoint(pose_key, world, scene.layout, standing, poi)
         bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
         view = View(
             positions=scene.layout.position,
@@ -269,15 +267,9 @@ def survey(
             distance=distance,
         )
         if is_empty is not None:
-            # Folded in: the viewpoints do not depend on it.
+            arena, viewpoint = world.arena.config, world.viewpoint
             absent = absence.without_poi(
-                jax.random.fold_in(key, 1),
-                world.sensors,
-                world.arena.config,
-                world.viewpoint,
-                view,
-                robot,
-                poi,
+                absent_key, world.sensors, arena, viewpoint, view, robot, poi
             )
             view = jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
         layout = dataclasses.replace(scene.layout, position=view.positions)

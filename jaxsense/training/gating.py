@@ -151,9 +151,8 @@ class FittingBoth:
           key: random key.
           number: of steps; static.
         """
-        # Folded in: `key` draws the rows of the detector, with a gate or without.
-        gate_key = jax.random.fold_in(key, 1)
-        return self.detector.draw(key, number), self.gate.draw(gate_key, number)
+        detector_key, gate_key = jax.random.split(key)
+        return self.detector.draw(detector_key, number), self.gate.draw(gate_key, number)
 
     def loss(
         self,

@@ -85,10 +85,10 @@ def init(
       measures_distance: whether the readings are distances, see `Gate`.
     """
     checks.require_shape("windows", windows, (None, None))
-    params = networks.init(key, MLP(config.hidden, num_labels), windows.shape[1])
+    network_key, gate_key = jax.random.split(key)
+    params = networks.init(network_key, MLP(config.hidden, num_labels), windows.shape[1])
     offset, scale = networks.statistics(windows)
-    # Folded in: `key` draws the network of the labels.
-    gate = gates.init(jax.random.fold_in(key, 1), offset, scale, measures_distance)
+    gate = gates.init(gate_key, offset, scale, measures_distance)
     return Classifier(params, offset, scale, gate, config.hidden, num_labels)
 
 
