@@ -7,9 +7,10 @@ one scene share its light, which drifts over positions.
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import Config
+from jaxsense.config import Config, ViewpointConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
@@ -18,6 +19,7 @@ from jaxsense.dqn.places import Places
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models, require_fitting
 from jaxsense.sim import world as worlds
+from jaxsense.sim.domain import Domain
 from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
@@ -116,12 +118,12 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
         so that every look casts a scan in the environment's own arena.
 
     Raises:
-      ValueError: if the shapes of `models` or `looks` do not match `config`, or `models.fusion` is
-        no `Fusion`.
+      ValueError: if the shapes of `models` or `looks` do not match `config`, `models.fusion` is no
+        `Fusion`, or `Live` looks are from distances that the detectors have not learned.
     """
     require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
-    _require_fitting(config, looks)
+    _require_fitting(config, models, looks)
     settings = config.team
     places = Places(
         sides=settings.sides,
@@ -137,8 +139,8 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
     return models.agent.mdp(of_number, places, config.modalities)
 
 
-def _require_fitting(config: Config, looks: Looks) -> None:
-    """Raises `ValueError` if the shapes of looks of this package do not match the settings."""
+def _require_fitting(config: Config, models: Models, looks: Looks) -> None:
+    """Raises `ValueError` if looks of this package match neither the settings nor the models."""
     if isinstance(looks, Bank):
         checks.require_one_each("looks", looks.features, config.modalities)
         for name, features in zip(config.modalities, looks.features, strict=True):
@@ -148,11 +150,24 @@ def _require_fitting(config: Config, looks: Looks) -> None:
             checks.require_finite("looks", features)
     if isinstance(looks, Live):
         checks.require_one_each("detectors", looks.detectors, config.modalities)
-        for sensor, detector in zip(looks.world.sensors, looks.detectors, strict=True):
+        of_each = zip(looks.world.sensors, looks.detectors, models.domains, strict=True)
+        for sensor, detector, domain in of_each:
             size, found = sensor.window * sensor.channels, len(detector.gate.offset)
             if found != size:
                 reason = f"reads windows of {found} numbers; must be of {size}, as config's are"
                 raise ValueError(f"models.detectors of {sensor.name}: {reason}")
+            _require_learned(looks.world.viewpoint, sensor.name, domain)
+
+
+def _require_learned(viewpoint: ViewpointConfig, name: str, domain: Domain) -> None:
+    """Raises `ValueError` if a detector has not learned from looks at some viewpoints."""
+    if isinstance(domain.distance, Tracer):
+        return
+    least, most = domain.distance.tolist()
+    is_learned = lambda x: (x > least - 1e-6) & (x < most + 1e-6)  # noqa: E731
+    learned = f"must be from {least:.3g} to {most:.3g} m, as the {name}'s detector has learned"
+    checks.require("viewpoint.min_distance", viewpoint.min_distance, is_learned, learned)
+    checks.require("viewpoint.max_distance", viewpoint.max_distance, is_learned, learned)
 
 
 def surveys(

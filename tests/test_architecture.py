@@ -1,5 +1,6 @@
 """The directions of imports, as `pyproject.toml` states them, and what the page on them names."""
 
+import ast
 import re
 import subprocess
 import sys

@@ -124,7 +124,7 @@ def test_the_way_of_looking_is_an_argument_of_jit_too(models):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def look(mdp, scene):
-        return mdp.looks.observe(jax.random.key(2), scene, jnp.int32(0), 1)[0]
+        return mdp.looks.observe(jax.random.key(3), scene, jnp.int32(0), 1)[0]
 
     mdp = looks.make_mdp(CONFIG, models)
     assert isinstance(mdp.looks, Live)

@@ -50,18 +50,12 @@ def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
       models: trained models.
       known: what the robot knows.
     """
+    of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
     num_robots, num_pois = known.times.shape
-    values_key, gains_key = jax.random.split(key)
-
-    def of_robot(key: Key, robot: Int[Array, ""]) -> Float[Array, " N"]:
-        return policy.gains(key, models, dataclasses.replace(known, robot=robot))
-
     gains = jnp.zeros((num_robots, num_pois))
-    if policy.is_unordered:
-        gains = jax.vmap(of_robot)(jax.random.split(gains_key, num_robots), jnp.arange(num_robots))
     return Opinion(
-        values=policy.values(values_key, models, known),
-        gains=gains,
+        values=policy.values(key, models, known),
+        gains=jax.vmap(of_robot)(jnp.arange(num_robots)) if policy.is_unordered else gains,
         counts_time=jnp.bool_(policy.counts_time(models.agent)),
         is_unordered=jnp.bool_(policy.is_unordered),
     )

@@ -242,6 +242,8 @@ def _locked(path: Path, field: str) -> Iterator[None]:
         except BlockingIOError:
             reason = "is being written by another process; wait for it to end"
             raise ConfigError(field, str(path), reason) from None
+        except OSError as error:
+            raise ConfigError(field, str(path), f"cannot be locked: {error.strerror}") from None
         yield
 
 

@@ -132,6 +132,7 @@ def value_iteration(w, **changed):
 IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
 IS_TASK = "must be from make, or one of map-v0, many-v0, noisy-v0, team-v0"
 BAD = jnp.array([0, 1, 7])
+FAR = dataclasses.replace(SMOKE, viewpoint=dataclasses.replace(SMOKE.viewpoint, max_distance=1.3))
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
     "load none": (lambda w: jaxsense.load(None), "run = None: must be a path"),
@@ -310,6 +311,10 @@ FUNCTIONS = {
             SMOKE, w.models, jaxsense.Live(w.world, w.models.detectors[:1])
         ),
         "detectors has 1 entries",
+    ),
+    "make_mdp live far": (
+        lambda w: jaxsense.make_mdp(FAR, w.models),
+        "viewpoint.max_distance = 1.3: must be from 0.3 to 1.2 m",
     ),
     "make_layout classes": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),

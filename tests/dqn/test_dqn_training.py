@@ -279,7 +279,7 @@ def test_the_replay_holds_as_many_transitions_as_the_settings_say():
 
 def test_every_start_of_a_share_and_every_action_is_drawn():
     config = replace(SMALL, epochs=200, chunk=200, num_starts=4 * SMALL.num_envs)
-    draws = training._draw(jax.random.key(0), config)
+    draws = training._draw(jax.random.split(jax.random.key(0), 3), config)
     assert set(np.unique(draws.start)) == {0, 1, 2, 3}
 
     @jax.jit
