@@ -142,7 +142,8 @@ class Kept:
 
     def _tell(self, error: Exception) -> None:
         """Tells once why programs are slower to start than they could be."""
-        reason = f"{type(error).__name__} {error}".splitlines()[0]
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        reason = f"{type(error).__name__} {text}".splitlines()[0]
         self._complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
 
     def _file(self, name: str, args: PyTree) -> Path:

@@ -25,7 +25,7 @@ class Domain:
       bearing: `[2]` of the PoI in the robot's frame, in radians: those of viewpoints, and others at
         which the window's rays lie alike around the PoI.
       step: `[2]` angle between neighbouring rays that the detector reads, in radians.
-      range: `[2]` `window_limit` of the sensor, twice.
+      range: `[2]` `window_limit` of the sensor, twice; the largest number for none.
     """
 
     distance: Float[Array, "2"]
@@ -44,7 +44,8 @@ class Domain:
           distance: expected distance of the PoI's centre, in metres.
         """
         least, most = sensor.steps
-        look = jnp.stack([distance, windows.wrapped(bearing), least, most, sensor.window_limit])
+        limit = jnp.nan_to_num(sensor.window_limit)
+        look = jnp.stack([distance, windows.wrapped(bearing), least, most, limit])
         limits = jnp.stack([self.distance, self.bearing, self.step, self.step, self.range])
         is_within = (look >= limits[:, 0] - _ROUNDING) & (look <= limits[:, 1] + _ROUNDING)
         return jnp.all(is_within)
@@ -72,5 +73,5 @@ def make_domain(config: Config, sensor: Sensor) -> Domain:
         distance=jnp.stack(distances) + deviations * errors.position_error * either,
         bearing=jnp.clip(jnp.stack(bearings), angles.min(), angles.max()),
         step=jnp.array(sensor.steps),
-        range=jnp.full(2, sensor.window_limit),
+        range=jnp.full(2, jnp.nan_to_num(sensor.window_limit)),
     )

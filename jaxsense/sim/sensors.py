@@ -102,8 +102,7 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
         self, readings: Float[Array | np.ndarray, "*axes"]
     ) -> Bool[Array | np.ndarray, "*axes"]:
         """Tells which readings the sensor can make; a beam without a return is infinitely long."""
-        most = jnp.inf if self.measures_distance else jnp.finfo(readings.dtype).max
-        return (readings >= 0) & (readings <= most)
+        return readings >= 0 if self.measures_distance else jnp.isfinite(readings)
 
     @property
     def reads_conditions(self) -> bool:

@@ -10,6 +10,7 @@ import pytest
 from tiny import KEY, TINY, stage_of
 
 from jaxsense.core import supervised
+from jaxsense.core.types import pytree
 from jaxsense.training.gating import Examples
 from jaxsense.training.surveys import Survey, Surveys
 from jaxsense.vae import detectors, gate
@@ -61,6 +62,14 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
         assert "calibrate" not in used
 
 
+@pytree
+class First(detectors.Fitting):
+    """Draws the rows that it has when it is fitted together with a gate."""
+
+    def draw(self, key, number):
+        return super().draw(jax.random.split(key)[0], number)
+
+
 @pytest.mark.slow
 def test_without_calibration_a_detector_is_what_was_trained():
     windows, labels = jax.random.normal(KEY, (48, 6)), jnp.arange(48) % 2
@@ -69,7 +78,7 @@ def test_without_calibration_a_detector_is_what_was_trained():
     stage = stage_of("detector_camera")
     state = stage.begin(KEY, TINY, **given)
     detector = detectors.init(KEY, windows, 2, config)
-    problem = detectors.Fitting(config, detector, windows, labels)
+    problem = First(config, detector, windows, labels)
     fit = supervised.start(detector.params, config)
     for key in stage.chunk_keys(KEY)[:2]:
         state, _ = stage.advance(key, TINY, state, **given)
