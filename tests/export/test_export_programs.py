@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
+import comparing
+import moments
 import pytest
 from exporting import CONFIG, played
 
-from benchmarks import exported, moments
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn import observation, team_mdp
@@ -164,7 +165,7 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, results):
 @pytest.mark.slow
 def test_decisions_are_those_of_missions(models, file):
     found = moments.choices(CONFIG, models, 60)
-    programs = exported.compare(CONFIG, models, file.read_bytes(), found)
+    programs = comparing.compare(CONFIG, models, file.read_bytes(), found)
     assert programs["decide"].states == len(found)
     assert {"classify", "decide", "write_camera", "detect_lidar"} < {*programs}
     assert all(each.different == 0 for each in programs.values())

@@ -7,11 +7,12 @@ import runpy
 import jax
 import jax.numpy as jnp
 import numpy as np
+import comparing
+import moments
 import pytest
 from exporting import CONFIG, EXAMPLE
 
 import jaxsense
-from benchmarks import exported, moments
 from jaxsense import export
 from jaxsense.config import CommunicationConfig
 from jaxsense.core import networks
@@ -129,7 +130,7 @@ def test_decisions_by_own_maps_are_those_of_missions(models, archive):
         np.testing.assert_allclose(merged["mean"], choice.inputs["mean"], atol=1e-5)
         np.testing.assert_allclose(merged["std"], choice.inputs["std"], atol=1e-5)
     assert any(np.any(choice.sums != 0) for choice in found)
-    each = exported.compare(OWN, models, archive, found)
+    each = comparing.compare(OWN, models, archive, found)
     assert {"decide", "merge", "tell_camera", "tell_lidar"} < {*each}
     assert all(program.different == 0 for program in each.values())
     # The class probabilities of a belief after one look are read with rounding, see the page.

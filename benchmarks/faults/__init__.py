@@ -1,1 +1,0 @@
-"""What a run survives: `python -m benchmarks.faults --help`."""
