@@ -29,7 +29,6 @@ from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
-from jaxsense.run.together import Trainings
 from jaxsense.show import tables, tensorboard
 from jaxsense.show.artist import Artist
 from jaxsense.show.terminal import Display, as_text
@@ -38,7 +37,6 @@ from jaxsense.summary.blocks import Header, Made
 from jaxsense.summary.read import read_made
 
 PROGRAM = "jaxsense.train"
-_MOST_TOGETHER = 16  # seeds in one program on an accelerator
 
 _COMMON = (
     *("--preset", "--seed", "--num-seeds", "--out", "--config", "--resume", "--devices"),
@@ -248,25 +246,16 @@ def _train(
     paths = seeds.paths(run).items()
     is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
     left = list(itertools.compress(paths, processes.of_first_process(is_left)))
-    # Threads of several processes would stack seeds in different orders.
-    is_alone = jax.default_backend() == "cpu" or jax.process_count() > 1
-    most = 1 if is_alone else _MOST_TOGETHER
-    size = max(1, min(len(left), most))  # all seeds may already be finished
-    trainings = Trainings(size, total=len(left))
     try:
         with (
             on_interrupt(stop),
             pipeline.compiled(
-                settings.config, monitor, workers, kept, trainings, policies
+                settings.config, monitor, workers, kept, len(left), policies
             ) as programs,
         ):
-            for first in range(0, len(left), size):
-                with contextlib.ExitStack() as opened:
-                    runs = [
-                        opened.enter_context(seeds.open_run(run, seed, path))
-                        for seed, path in left[first : first + size]
-                    ]
-                    failed |= _train_together(arguments, runs, programs, monitor, console)
+            for seed, path in left:
+                with seeds.open_run(run, seed, path) as of_seed:
+                    failed |= _train_one(arguments, of_seed, programs, monitor, console)
                 monitor.stopwatch.restart()
     except Stopped:
         if jax.process_index() == 0:
@@ -284,61 +273,45 @@ def _train(
         _summarise_seeds(run, failed)
 
 
-def _train_together(
+def _train_one(
     arguments: Arguments,
-    runs: list[RunDirectory],
+    run: RunDirectory,
     programs: Programs,
     monitor: Monitor,
     console: rich.console.Console,
 ) -> dict[int, str]:
-    """Trains some seeds side by side and writes their runs; returns why which seeds failed."""
-
-    def display(run: RunDirectory) -> Display:
-        records = [run.append_metrics]
-        if arguments.tensorboard:
-            records.append(tensorboard.make_writer(run.path / "tensorboard"))
-        return Display(console, records, quiet=arguments.quiet or run is not runs[0])
-
-    for run in runs:
-        if several := compare.several_origins(run.made("mission")):
-            _warn(f"{run.path}: {several}")
-    displays = [display(run) for run in runs]
-    programs.trainings.begin(len(runs))
-    artist, failed = Artist(), dict[int, str]()
-
-    def train(i: int) -> summary.Results | StageError:
-        run, config = runs[i], runs[i].settings.config
-        key, checkpoints = jax.random.key(run.settings.seed), run.checkpoints
-        of_seed = monitor if len(runs) == 1 else monitor.beside(displays[i].show)
+    """Trains one seed and writes its run; returns why it failed, if it did."""
+    records = [run.append_metrics]
+    if arguments.tensorboard:
+        records.append(tensorboard.make_writer(run.path / "tensorboard"))
+    if several := compare.several_origins(run.made("mission")):
+        _warn(f"{run.path}: {several}")
+    config, checkpoints, artist = run.settings.config, run.checkpoints, Artist()
+    key = jax.random.key(run.settings.seed)
+    with Display(console, records, quiet=arguments.quiet) as display, artist:
+        monitor.begin(display.show)
         try:
-            learned = pipeline.learn(key, config, programs, of_seed, checkpoints)
+            learned = pipeline.learn(key, config, programs, monitor, checkpoints)
             artist.draw(run.path, lambda: _report().of_training(config, learned))
-            played = pipeline.play(key, config, programs, of_seed, learned, checkpoints)
-            artist.draw(run.path, lambda: _report().of_missions(config, learned, played))
-            return {**learned.results, "mission": played.missions}
+            played = pipeline.play(key, config, programs, monitor, learned, checkpoints)
         except StageError as error:
-            return error
-        finally:
-            programs.trainings.leave()
-
-    with displays[0], artist:
-        monitor.begin(displays[0].show)
-        results = devices.side_by_side(train, len(runs))
+            _warn(f"{error}; earlier checkpoints are in {run.path}")
+            return {run.settings.seed: str(error)}
+        artist.draw(run.path, lambda: _report().of_missions(config, learned, played))
         drawn = artist.finished()
-        timing = monitor.stopwatch.timing(len(runs))
-        for run, result in zip(runs, results, strict=True):
-            if isinstance(result, StageError):
-                failed[run.settings.seed] = str(result)
-                _warn(f"{result}; earlier checkpoints are in {run.path}")
-                continue
-            monitor.check_stop()
-            header = _header(run, run.sign("mission"))
-            found: summary.Summary = {**header, "timing": timing, **result}
-            _report().write(run, drawn[run.path], found)
-            monitor.check_stop()
-            # Last, for it marks the run as finished.
-            rundir.write_json(run.path / "summary.json", found)
-    return failed
+        monitor.check_stop()
+        header = _header(run, run.sign("mission"))
+        found: summary.Summary = {
+            **header,
+            "timing": monitor.stopwatch.timing(),
+            **learned.results,
+            "mission": played.missions,
+        }
+        _report().write(run, drawn[run.path], found)
+        monitor.check_stop()
+        # Last, for it marks the run as finished.
+        rundir.write_json(run.path / "summary.json", found)
+    return {}
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:

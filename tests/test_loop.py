@@ -19,7 +19,6 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.together import Trainings
 from jaxsense.training.stage import Progress, Stage
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
@@ -143,8 +142,8 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, monkeypatch
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
     monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
     monkeypatch.setattr(programs, "stages", lambda config: kinds)
-    monitor, trainings = Monitor(), Trainings(1, total=2)
-    with pipeline.compiled(SMOKE, monitor, trainings=trainings) as compiled:
+    monitor = Monitor()
+    with pipeline.compiled(SMOKE, monitor, trainings=2) as compiled:
         shared = compiled.of(kinds[0])
         assert shared is compiled.of(kinds[1])
         every = [shared.advance, compiled.of(kinds[2]).finish]

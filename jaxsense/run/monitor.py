@@ -55,14 +55,11 @@ class Stopwatch:
         with self._lock:
             self._stages.setdefault(stage, {"compile_s": 0.0, "run_s": 0.0})[kind] += seconds
 
-    def timing(self, number: int) -> Timing:
-        """The time since the start, divided equally among a number of concurrent runs."""
+    def timing(self) -> Timing:
+        """The time since the start."""
         with self._lock:
-            stages: dict[str, StageTiming] = {
-                name: {"compile_s": each["compile_s"] / number, "run_s": each["run_s"] / number}
-                for name, each in self._stages.items()
-            }
-        return {"total_s": (time.perf_counter() - self._begin) / number, "stages": stages}
+            stages = {name: each.copy() for name, each in self._stages.items()}
+        return {"total_s": time.perf_counter() - self._begin, "stages": stages}
 
 
 class Monitor:
@@ -72,30 +69,22 @@ class Monitor:
         self,
         listener: Listener = lambda stage, done, total, metrics: None,
         warn: Callable[[str], None] = lambda text: None,
-        stopwatch: Stopwatch | None = None,
     ):
         """Begins a run.
 
         Args:
           listener: receives progress.
           warn: receives a line about a failure that does not end the run.
-          stopwatch: of the run; a new one by default.
         """
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self.warn, self.stopwatch = warn, stopwatch or Stopwatch()
+        self.warn, self.stopwatch = warn, Stopwatch()
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
         """Begins another run: forgets a failure and replaces the listener."""
         self._failure: Exception | None = None
         self._one_listener = listener
-
-    def beside(self, listener: Listener) -> "Monitor":
-        """Returns a monitor for a concurrent run that shares this one's stopwatch and stop flag."""
-        other = Monitor(listener, self.warn, self.stopwatch)
-        other._stop = self._stop
-        return other
 
     def _listener(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
         """Calls the listener, for one stage at a time."""

@@ -20,7 +20,6 @@ from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
-from jaxsense.run.together import Trainings
 from jaxsense.summary import compare
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
@@ -74,7 +73,7 @@ def compiled(
     monitor: Monitor,
     workers: Workers = ALONE,
     kept: Kept | None = None,
-    trainings: Trainings | None = None,
+    trainings: int = 0,
     policies: OwnPolicies | None = None,
 ) -> Iterator[Programs]:
     """The programs of runs with the same settings, compiled in the background.
@@ -82,10 +81,9 @@ def compiled(
     Args:
       config: all settings.
       monitor: receives the time that it takes.
-      workers: what shares scenes, missions and seeds.
+      workers: share scenes and missions.
       kept: where to keep compiled programs for later runs, if anywhere.
-      trainings: call the programs; if their total is given, the programs of a stage are let go of
-        after the last of them.
+      trainings: see `compile_programs`.
       policies: custom policies by name; keep no programs with these, whose code may change.
 
     Raises:

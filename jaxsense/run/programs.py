@@ -22,7 +22,6 @@ from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import batches, films, missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.together import SharedProgram, Trainings
 from jaxsense.training.stage import Output, Stage
 from jaxsense.training.stages import stages
 
@@ -56,9 +55,9 @@ class StagePrograms:
       shapes: known once the programs are traced.
     """
 
-    begin: Program | SharedProgram
-    advance: Program | SharedProgram
-    finish: Program | SharedProgram
+    begin: Program
+    advance: Program
+    finish: Program
     shapes: Future[Shapes]
 
     def release(self) -> None:
@@ -77,7 +76,6 @@ class Programs:
       of_stages: their programs, by name.
       player: of the missions.
       workers: threads or devices that share rows and missions.
-      trainings: how many run side by side, and in all.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
       left: how often each stage's programs are still needed, if it is known.
     """
@@ -87,7 +85,6 @@ class Programs:
     of_stages: dict[str, StagePrograms]
     player: Future[missions.Player]
     workers: Workers
-    trainings: Trainings
     policies: OwnPolicies | None = None
     left: Counter[str] = dataclasses.field(default_factory=Counter)
     _lock: threading.Lock = dataclasses.field(default_factory=threading.Lock)
@@ -117,7 +114,7 @@ def compile_programs(
     config: Config,
     compiler: Compiler,
     workers: Workers = ALONE,
-    trainings: Trainings | None = None,
+    trainings: int = 0,
     policies: OwnPolicies | None = None,
 ) -> Programs:
     """Starts to trace and compile the programs of a run in the background.
@@ -125,34 +122,28 @@ def compile_programs(
     Args:
       config: all settings.
       compiler: compiles them.
-      workers: what shares rows, missions and seeds.
-      trainings: call the programs, each from its own threads; by default one at a time.
+      workers: share rows and missions.
+      trainings: number of trainings after whose last call a program is released; 0 for never.
       policies: of missions, by name, in addition to `dqn.POLICIES`.
     """
-    found, trainings = stages(config), trainings or Trainings()
-
-    def program(stage: Stage, part: str) -> Program | SharedProgram:
-        alone = Program(compiler, stage.program, part)
-        is_shared = trainings.number > 1 and not stage.has_rows
-        return SharedProgram(alone, trainings, workers) if is_shared else alone
+    found = stages(config)
 
     programs = Programs(
         config=config,
         stages=found,
         of_stages={
             stage.program: StagePrograms(
-                begin=program(stage, "begin"),
-                advance=program(stage, "advance"),
-                finish=program(stage, "finish"),
+                begin=Program(compiler, stage.program, "begin"),
+                advance=Program(compiler, stage.program, "advance"),
+                finish=Program(compiler, stage.program, "finish"),
                 shapes=Future(),
             )
             for stage in found
         },
         player=Future(),
         workers=workers,
-        trainings=trainings,
         policies=policies,
-        left=Counter(stage.program for stage in found for _ in range(trainings.total or 0)),
+        left=Counter(stage.program for stage in found for _ in range(trainings)),
     )
 
     thread = ThreadPoolExecutor(1, "trace")
@@ -223,7 +214,7 @@ def _trace_stage(programs: Programs, stage: Stage) -> None:
         return stage.finish(config, state, **inputs)
 
     divided = functools.partial(jax.eval_shape, functools.partial(stage.divide, config))
-    if isinstance(compiled.begin, Program) and stage.has_rows:
+    if stage.has_rows:
         number = len(jax.tree.leaves(inputs)[0])
         workers = workers_for(number, programs.workers)
         split = padded(inputs, workers)
