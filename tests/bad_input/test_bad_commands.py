@@ -27,7 +27,6 @@ from jaxsense.run.files import WriteError
 from jaxsense.run.monitor import StageError
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings
-from jaxsense.run.together import Trainings
 
 SECONDS = 10.0
 
@@ -376,7 +375,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    compiled = SimpleNamespace(trainings=Trainings())
+    compiled = SimpleNamespace()
     monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
     monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]

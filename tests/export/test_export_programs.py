@@ -3,12 +3,12 @@
 import json
 import zipfile
 
+import comparing
 import jax
 import jax.numpy as jnp
+import moments
 import numpy as np
 import onnx
-import comparing
-import moments
 import pytest
 from exporting import CONFIG, played
 

@@ -4,11 +4,11 @@ import dataclasses
 import io
 import runpy
 
+import comparing
 import jax
 import jax.numpy as jnp
-import numpy as np
-import comparing
 import moments
+import numpy as np
 import pytest
 from exporting import CONFIG, EXAMPLE
 
