@@ -5,12 +5,15 @@ from stored features of such scans. Single looks have the same distribution in b
 one scene share its light, which drifts over positions.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import Config, ViewpointConfig
+from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
@@ -19,12 +22,13 @@ from jaxsense.dqn.places import Places
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import Models, require_fitting
 from jaxsense.sim import world as worlds
-from jaxsense.sim.domain import Domain
+from jaxsense.sim.domain import make_domain
 from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
 
 _SCENES_AT_ONCE = 512
+_ROUNDING = 1e-5
 _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 
@@ -119,7 +123,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
 
     Raises:
       ValueError: if the shapes of `models` or `looks` do not match `config`, `models.fusion` is no
-        `Fusion`, or `Live` looks are from distances that the detectors have not learned.
+        `Fusion`, or `Live` looks lie outside the detectors' domains, see `sim.Domain`.
     """
     require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
@@ -150,24 +154,26 @@ def _require_fitting(config: Config, models: Models, looks: Looks) -> None:
             checks.require_finite("looks", features)
     if isinstance(looks, Live):
         checks.require_one_each("detectors", looks.detectors, config.modalities)
-        of_each = zip(looks.world.sensors, looks.detectors, models.domains, strict=True)
-        for sensor, detector, domain in of_each:
+        for sensor, detector in zip(looks.world.sensors, looks.detectors, strict=True):
             size, found = sensor.window * sensor.channels, len(detector.gate.offset)
             if found != size:
                 reason = f"reads windows of {found} numbers; must be of {size}, as config's are"
                 raise ValueError(f"models.detectors of {sensor.name}: {reason}")
-            _require_learned(looks.world.viewpoint, sensor.name, domain)
+        _require_learned(config, looks.world, models)
 
 
-def _require_learned(viewpoint: ViewpointConfig, name: str, domain: Domain) -> None:
-    """Raises `ValueError` if a detector has not learned from looks at some viewpoints."""
-    if isinstance(domain.distance, Tracer):
-        return
-    least, most = domain.distance.tolist()
-    is_learned = lambda x: (x > least - 1e-6) & (x < most + 1e-6)  # noqa: E731
-    learned = f"must be from {least:.3g} to {most:.3g} m, as the {name}'s detector has learned"
-    checks.require("viewpoint.min_distance", viewpoint.min_distance, is_learned, learned)
-    checks.require("viewpoint.max_distance", viewpoint.max_distance, is_learned, learned)
+def _require_learned(config: Config, world: World, models: Models) -> None:
+    """Raises `ValueError` if looks are not within the domains of the models' detectors."""
+    config = dataclasses.replace(config, viewpoint=world.viewpoint)
+    for sensor, learned in zip(world.sensors, models.domains, strict=True):
+        for name, found in vars(make_domain(config, sensor)).items():
+            limits = getattr(learned, name)
+            if isinstance(limits, Tracer):
+                continue
+            least, most = limits.tolist()
+            is_learned = lambda x, of=limits: np.abs(x - np.clip(x, *of)) < _ROUNDING  # noqa: E731
+            expected = f"must be from {least:.3g} to {most:.3g}, as its detector has learned"
+            checks.require(f"{name} of looks by the {sensor.name}", found, is_learned, expected)
 
 
 def surveys(
@@ -313,12 +319,13 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
       For each modality `[C, S, D_m]`.
 
     Raises:
-      ValueError: if `samples` is not positive.
+      ValueError: if `samples` is not positive, or looks lie outside the detectors' domains.
     """
     checks.require_key(key)
     checks.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)
+    _require_learned(config, world, models)
     number = -(-samples * num_classes // config.arena.num_pois)
 
     @jax.jit

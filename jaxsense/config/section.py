@@ -5,9 +5,11 @@ shapes a program is structure.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform, get_type_hints
 
 import jax
+import numpy as np
 from jax.core import Tracer
 
 from jaxsense.config.checks import UNKNOWN, check_fields
@@ -63,9 +65,11 @@ class Section(Checked):
         register(cls, cls._LEAVES, [name for name in names if name not in cls._LEAVES])
 
     def __post_init__(self):
-        known = _known(self)
-        check_fields(known)
-        known.check()
+        # Of an array with axes, the extremes are checked.
+        for extreme in (np.min, np.max):
+            known = _known(self, extreme)
+            check_fields(known)
+            known.check()
         for name, value in vars(self).items():
             if not any(isinstance(leaf, _ARRAYS) for leaf in jax.tree.leaves(value)):
                 object.__setattr__(self, name, getattr(known, name))
@@ -77,15 +81,17 @@ def _is_leaf(kind: object) -> bool:
     return is_section or _LEAF in getattr(kind, "__metadata__", ())
 
 
-def _known(value: Any) -> Any:
-    """A value of the settings with `UNKNOWN` for what has no value yet."""
+def _known(value: Any, extreme: Callable[..., np.generic]) -> Any:
+    """A value of the settings, one number for each array, with `UNKNOWN` for those without."""
     if isinstance(value, Section):
         known = object.__new__(type(value))
         for name, each in vars(value).items():
-            object.__setattr__(known, name, _known(each) if name in value._LEAVES else each)
+            object.__setattr__(
+                known, name, _known(each, extreme) if name in value._LEAVES else each
+            )
         return known
     if isinstance(value, tuple):
-        return tuple(map(_known, value))
-    if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.ndim == 0:
-        return value.item()
+        return tuple(_known(each, extreme) for each in value)
+    if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.size:
+        return extreme(np.asarray(value)).item()
     return UNKNOWN if isinstance(value, _ARRAYS) else value

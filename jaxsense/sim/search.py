@@ -1,5 +1,6 @@
 """Search: the windows of a scan in which a robot that may be misplaced looks for a PoI."""
 
+import dataclasses
 import math
 
 import jax.numpy as jnp
@@ -46,7 +47,8 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
     between = sensor.field_of_view * sensor.stride / (len(sensor.angles) - 1)
     off = math.hypot(search.heading, math.degrees(search.position / _NEAREST))
     most = (len(sensor.angles) - 1) // sensor.stride + 1
-    return sensor.replace(window=min(sensor.window + 2 * math.ceil(off / between), most))
+    window = min(sensor.window + 2 * math.ceil(off / between), most)
+    return dataclasses.replace(sensor, window=window)
 
 
 def candidates(

@@ -7,6 +7,7 @@ all sensors alike.
 
 import abc
 import dataclasses
+from typing import dataclass_transform
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from mujoco import mjx
 from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
 from jaxsense.config.checks import named_function
 from jaxsense.core import checks
-from jaxsense.core.types import Index, Key, is_static
+from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, disturbances, raycast
 from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
 from jaxsense.sim.light import Light
@@ -32,7 +33,9 @@ Surfaces = dict[str, jax.Array]
 `arena.attributes`."""
 
 
-class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
+@dataclass_transform(frozen_default=True, field_specifiers=(struct.field,))
+@pytree
+class Sensor(abc.ABC):
     """A scanline sensor on a robot, a frozen pytree.
 
     A subclass defines `read`. It becomes a dataclass and a pytree without a
@@ -54,6 +57,7 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
       ValueError: if a size is not a whole number above 0, or the height is not above 0.
     """
 
+    _: dataclasses.KW_ONLY
     name: str = struct.field(pytree_node=False, default="")
     height: float = struct.field(pytree_node=False)
     rays: Rays = struct.field(pytree_node=False)
@@ -64,6 +68,9 @@ class Sensor(struct.PyTreeNode, abc.ABC, kw_only=True):
     measures_distance: bool = struct.field(pytree_node=False, default=False)
     window_limit: float | jax.Array = np.inf
     blind: float | jax.Array = 0.0
+
+    def __init_subclass__(cls):
+        pytree(cls)
 
     def __post_init__(self):
         for field in ("window", "channels", "stride"):

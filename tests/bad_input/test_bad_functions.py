@@ -132,7 +132,14 @@ def value_iteration(w, **changed):
 IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
 IS_TASK = "must be from make, or one of map-v0, many-v0, noisy-v0, team-v0"
 BAD = jnp.array([0, 1, 7])
-FAR = dataclasses.replace(SMOKE, viewpoint=dataclasses.replace(SMOKE.viewpoint, max_distance=1.3))
+
+
+def changed(section, **values):
+    """Settings of the smoke preset but for some of a section."""
+    of_section = dataclasses.replace(getattr(SMOKE, section), **values)
+    return dataclasses.replace(SMOKE, **{section: of_section})
+
+
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
     "load none": (lambda w: jaxsense.load(None), "run = None: must be a path"),
@@ -313,8 +320,20 @@ FUNCTIONS = {
         "detectors has 1 entries",
     ),
     "make_mdp live far": (
-        lambda w: jaxsense.make_mdp(FAR, w.models),
-        "viewpoint.max_distance = 1.3: must be from 0.3 to 1.2 m",
+        lambda w: jaxsense.make_mdp(changed("viewpoint", max_distance=1.3), w.models),
+        "distance of looks by the camera = 1.2999999523162842: must be from 0.3 to 1.2, as",
+    ),
+    "make_mdp live aside": (
+        lambda w: jaxsense.make_mdp(changed("viewpoint", max_bearing=30.0), w.models),
+        "bearing of looks by the camera = -0.5",
+    ),
+    "make_mdp live dense": (
+        lambda w: jaxsense.make_mdp(changed("lidar", field_of_view=120.0), w.models),
+        "of looks by the lidar = ",
+    ),
+    "detections range": (
+        lambda w: jaxsense.detections(w.key, changed("lidar", window_range=3.0), w.models, 1),
+        "range of looks by the lidar = 3.0: must be from 1.5 to 1.5, as its detector has learned",
     ),
     "make_layout classes": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),

@@ -583,3 +583,11 @@ def test_64_bits_are_refused_in_one_line(tmp_path):
 def test_an_error_shows_control_characters_and_leaves_text_as_it_is():
     found = str(ConfigError("run", "a", "holds \x1b[2J\n of mission-2"))
     assert found == "run = 'a': holds \\x1b[2J\\n of mission-2"
+
+
+@pytest.mark.parametrize("value", [[0.1, -0.1], [-0.1, 0.1], [[np.nan, 0.0]]])
+def test_every_number_of_an_array_is_checked(value):
+    with pytest.raises(ConfigError, match=r"lidar\.range_noise = (-0\.1|nan)"):
+        dataclasses.replace(SMOKE.lidar, range_noise=jax.numpy.array(value))
+    of_seeds = dataclasses.replace(SMOKE.lidar, range_noise=jax.numpy.array([0.1, 0.2]))
+    assert of_seeds.range_noise.shape == (2,)

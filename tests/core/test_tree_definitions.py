@@ -1,7 +1,10 @@
 """The class belongs to the tree definition: no program of one class runs with another."""
 
 import dataclasses
+import importlib.util
 import itertools
+import pkgutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +14,7 @@ from flax import nnx, serialization
 from jax.sharding import SingleDeviceSharding
 
 import jaxsense
-from jaxsense import dqn
+from jaxsense import dqn, sim
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn.map_agent import MapAgent
@@ -104,6 +107,32 @@ def test_state_dictionaries_are_those_of_earlier_checkpoints():
 @pytest.fixture(scope="module")
 def mdp():
     return jaxsense.tasks.make("map-v0", agent="camera").mdp
+
+
+def own_sensor(value):
+    class Own(sim.Sensor):
+        gain: jax.Array
+
+        def read(self, key, hits, surfaces, light):
+            return value * self.gain
+
+    return Own(jnp.float32(1), height=0.1, rays=sim.Fan(8, 90.0), window=4)
+
+
+def test_a_sensor_that_is_defined_again_runs_its_own_program():
+    read = jax.jit(lambda sensor: sensor.read(None, None, None, None))
+    own = [own_sensor(float(value)) for value in range(60)]
+    assert [float(read(sensor)) for sensor in own] == list(range(60))
+    assert jax.tree.structure(own[0]) != jax.tree.structure(own[1])
+
+
+def test_every_pytree_of_the_package_names_its_class():
+    modules = pkgutil.walk_packages(jaxsense.__path__, "jaxsense.")
+    for module in modules:
+        source = importlib.util.find_spec(module.name)
+        text = Path(source.origin).read_text(encoding="utf-8") if source.origin else ""
+        assert "PyTreeNode" not in text, module.name
+        assert "register_dataclass(" not in text.replace("`jax.tree_util.register_dataclass`", "")
 
 
 def test_placeholder_leaves_pass_through_every_transformation(mdp):

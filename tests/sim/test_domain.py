@@ -97,8 +97,10 @@ class Turned:
 def test_an_unevenly_spaced_sensor_is_not_the_one_that_was_learned():
     odd = np.arange(683) % 2
     rays = Turned(LIDAR.angles + np.float32(0.002) * odd)
-    assert not DOMAINS[1].contains(LIDAR.replace(rays=rays), jnp.float32(0), jnp.float32(1))
-    even = LIDAR.replace(rays=Turned(LIDAR.angles))
+    assert not DOMAINS[1].contains(
+        dataclasses.replace(LIDAR, rays=rays), jnp.float32(0), jnp.float32(1)
+    )
+    even = dataclasses.replace(LIDAR, rays=Turned(LIDAR.angles))
     assert DOMAINS[1].contains(even, jnp.float32(0), jnp.float32(1))
 
 
