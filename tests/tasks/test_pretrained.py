@@ -72,6 +72,6 @@ def test_a_training_repeats_the_models_that_travel(tmp_path):
     np.testing.assert_allclose(again.fusion.classes.mean, models.fusion.classes.mean, atol=0.3)
     for one, other in zip(again.look_values, models.look_values, strict=True):
         # A gain near `mdp.min_increase`, below which a look has the reward -1, may fall on its
-        # other side: 11 of 2,016 since geoms are placed by another formula. With another seed a
-        # quarter and more differ.
-        assert np.mean(np.abs(one.q - other.q) > 0.05) < 0.01
+        # other side: 37 of 2,016 since the parameters of detectors are drawn with a key of their
+        # own. With another seed a quarter and more differ.
+        assert np.mean(np.abs(one.q - other.q) > 0.05) < 0.025
