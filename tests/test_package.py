@@ -143,8 +143,3 @@ def test_examples_of_your_robot_run(tmp_path, monkeypatch, capsys):
     run_example(page, 1, names)
     assert names["scan"].shape == (683,)
     assert capsys.readouterr().out == "(683,) True\nFalse\n"
-
-
-def test_example_of_the_settings_runs():
-    config = run_example(ROOT / "docs" / "settings.md")["config"]
-    assert config.arena.num_pois == 4
