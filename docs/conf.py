@@ -129,10 +129,10 @@ NAMED = re.compile(r"(\[`(?:\w+\.)*(\w+)`\])\(\.\./(jaxsense(?:/\w+)+)\.py\)")
 
 # What pages link to for readers on code hosts, and the page of the site in its place.
 MADE = {
-    "](../jaxsense/config)": "](generated/settings.md)",
-    "](../jaxsense/summary/blocks.py)": "](generated/summary.md)",
-    "](../jaxsense/__init__.pyi)": "](generated/api.md)",
-    **{f"](../{file}": f"](generated/{page}" for page, file in generate.OUTSIDE.items()},
+    "](../jaxsense/config)": "](site/settings.md)",
+    "](../jaxsense/summary/blocks.py)": "](site/summary.md)",
+    "](../jaxsense/__init__.pyi)": "](site/api.md)",
+    **{f"](../{file}": f"](site/{page}" for page, file in generate.OUTSIDE.items()},
 }
 
 

@@ -1,6 +1,6 @@
 """Pages that the code makes, for the site alone: settings, public names, keys of `summary.json`.
 
-`conf.py` writes them to `docs/generated` when Sphinx starts; Git ignores that folder.
+`conf.py` writes them to `docs/site` when Sphinx starts; Git ignores that folder.
 """
 
 import ast
@@ -351,12 +351,12 @@ PAGES = {
     "summary.md": lambda: f"{SUMMARY}\n{keys()}",
     **{page: functools.partial(_outside, file) for page, file in OUTSIDE.items()},
 }
-"""Each page of `docs/generated`, and what makes it."""
+"""Each page of `docs/site`, and what makes it."""
 
 
 def write() -> None:
     """Writes the pages that have changed, so that Sphinx reads only those again."""
-    folder = DOCS / "generated"
+    folder = DOCS / "site"
     folder.mkdir(exist_ok=True)
     for name, text in ((name, make()) for name, make in PAGES.items()):
         if not (folder / name).exists() or (folder / name).read_text(encoding="utf-8") != text:

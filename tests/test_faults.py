@@ -1,4 +1,4 @@
-"""What becomes of runs that something happens to; see `docs/reliability.md`."""
+"""What becomes of runs that something happens to; see `docs/faq.md`."""
 
 import json
 import subprocess
@@ -57,7 +57,7 @@ def test_only_the_chosen_faults_are_tried(trials, capsys):
     assert "another" not in capsys.readouterr().out
 
 
-@pytest.mark.slow  # some 40 minutes, as for the table of `docs/reliability.md`
+@pytest.mark.slow  # some 40 minutes, as `benchmarks.faults` does
 @pytest.mark.timeout(3 * 3600)
 def test_all_faults_end_as_they_must(capsys):
     with capsys.disabled():
