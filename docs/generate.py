@@ -295,37 +295,42 @@ SETTINGS = """# Settings
 
 Each setting is an option of `python -m jaxsense.train`, with `-` in place of `_`:
 
-    python -m jaxsense.train --arena.num-pois 4 --mission.policies latent naive --mission.no-redecides
+    python -m jaxsense.train --arena.num-pois 4 --mission.no-redecides
 
-The name alone turns a setting on; `no-` before its last part turns it off. In Python, settings are frozen dataclasses:
-`dataclasses.replace(config, arena=dataclasses.replace(config.arena, num_pois=4))`. Defaults are those of preset
-`default`; [the end of this page](#presets) lists what the other presets change. Settings marked † only enter the
-arithmetic: changing them recompiles nothing, and JAX may trace them.
+The name alone turns a setting on; `no-` before its last part turns it off. In Python, settings
+are frozen dataclasses: `dataclasses.replace(config, arena=dataclasses.replace(config.arena,
+num_pois=4))`. Defaults are those of preset `default`; [the end of this page](#presets) lists
+what the other presets change. Settings marked † only enter the arithmetic: changing them
+recompiles nothing, and JAX may trace them.
 """
 API = """# API
 
-Every public name, with the first sentence of its docstring. [The reference](../reference.rst) has the rest.
+Every public name, with the first sentence of its docstring. [The reference](../reference.rst)
+has the rest.
 
 ## What is stable
 
-Versions follow [Semantic Versioning](https://semver.org). These change only with a new minor version as long as the
-major version is 0, and after that only with a new major version:
+Versions follow [Semantic Versioning](https://semver.org). These change only with a new minor
+version as long as the major version is 0, and after that only with a new major version:
 
-- the names on this page, the arguments of the functions and the fields of the classes behind them;
+- the names on this page, the arguments of the functions and the fields of the classes behind
+  them;
 - `jaxsense.train.main`, `jaxsense.evaluate.main`, and `main` and `load` of `jaxsense.export`;
 - `read` and `RecordedLooks` of `jaxsense.run.recordings`;
-- `reset` and `run_episode` of `jaxsense.dqn.episodes`, and `best` and `Trained` of `jaxsense.dqn.policies`;
+- `reset` and `run_episode` of `jaxsense.dqn.episodes`, and `best` and `Trained` of
+  `jaxsense.dqn.policies`;
 - [settings](settings.md), [commands](../getting-started.md#first-steps) and their options;
 - the keys of [`summary.json`](summary.md);
-- the names and the content of [tasks](../tasks.md): a task that changes gets a new version in its name;
+- the names and the content of [tasks](../tasks.md): a task that changes gets a new version in
+  its name;
 - what [an exported archive](../interfaces.md#export) holds.
 
 Everything else may change in any version. `jaxsense.load` refuses a run that it cannot read.
 """
 SUMMARY = """# Keys of summary.json
 
-The keys are a public contract. A run's `report.html` explains those that the run has.
-[Getting started](../getting-started.md#summaryjson) says how to read them.
+The keys are a public contract. A run's `report.html` explains those that the run has. [Getting
+started](../getting-started.md#summaryjson) says how to read them.
 """
 OUTSIDE = {
     "changelog.md": "CHANGELOG.md",
