@@ -16,6 +16,8 @@ import jaxsense
 sys.path.insert(0, str(Path(__file__).parent))
 import generate
 
+generate.write()
+
 project = "jaxsense"
 author = "the jaxsense authors"
 copyright = f"2026, {author}"
@@ -125,19 +127,13 @@ SOURCE = re.compile(r"\]\(\.\./(jaxsense(?:/(?!_)\w+)*)(?:\.py)?\)")
 NAMED = re.compile(r"(\[`(?:\w+\.)*(\w+)`\])\(\.\./(jaxsense(?:/\w+)+)\.py\)")
 
 
-# A line that links to a file outside of `docs`, such as the changelog, for readers on GitHub.
-OUTSIDE = re.compile(r"^.*\]\(\.\./((?:\w+/)*[A-Z]+\.md)\).*$", re.MULTILINE)
-
-
-def show_files(app: Sphinx, name: str, source: list[str]) -> None:
-    """Shows the file, without its title, where a line of a page links to it."""
-
-    def included(found: re.Match[str]) -> str:
-        with (Path(app.srcdir).parent / found[1]).open(encoding="utf-8") as file:
-            title = file.readline().strip()
-        return f'```{{include}} ../{found[1]}\n:start-after: "{title}"\n:relative-docs: docs/\n```'
-
-    source[0] = OUTSIDE.sub(included, source[0])
+# What pages link to for readers on code hosts, and the page of the site in its place.
+MADE = {
+    "](../jaxsense/config)": "](site/settings.md)",
+    "](../jaxsense/summary/blocks.py)": "](site/summary.md)",
+    "](../jaxsense/__init__.pyi)": "](site/api.md)",
+    **{f"](../{file}": f"](site/{page}" for page, file in generate.OUTSIDE.items()},
+}
 
 
 def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
@@ -148,6 +144,8 @@ def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
         is_defined = name in (each.defined for each in generate.definitions(module))
         return f"{text}(#{module}.{name})" if is_defined else found[0]
 
+    for link, page in MADE.items():
+        source[0] = source[0].replace(link, page)
     source[0] = NAMED.sub(to_definition, source[0])
     source[0] = SOURCE.sub(lambda found: f"](#{found[1].replace('/', '.')})", source[0])
 
@@ -155,6 +153,5 @@ def link_to_reference(app: Sphinx, name: str, source: list[str]) -> None:
 def setup(app: Sphinx) -> None:
     """Registers what this file adds to Sphinx."""
     app.connect("source-read", link_to_reference)
-    app.connect("source-read", show_files)
     app.connect("autodoc-process-docstring", keep_colons, priority=400)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

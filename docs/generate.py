@@ -1,7 +1,6 @@
-"""Writes what pages take from the code: `python docs/generate.py`.
+"""Pages that the code makes, for the site alone: settings, public names, keys of `summary.json`.
 
-`settings.md` lists the fields of the settings, and `api.md` the names that packages export, below
-what people have written there. A test compares both with the code.
+`conf.py` writes them to `docs/site` when Sphinx starts; Git ignores that folder.
 """
 
 import ast
@@ -18,10 +17,10 @@ from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.config.checks import Limits
 from jaxsense.config.options import docs
 from jaxsense.config.section import Section
+from jaxsense.summary import BLOCKS
 
 DOCS = Path(__file__).parent
 SOURCE = Path(jaxsense.__file__).parent
-MARK = "<!-- What follows is made by `python docs/generate.py`. -->"
 
 
 def settings() -> str:
@@ -282,25 +281,88 @@ def _paragraph(text: str | None) -> str:
     return found[0] if found else first
 
 
-TABLES = {"settings.md": settings, "api.md": api}
-"""Each page, and what makes its tables."""
+def keys() -> str:
+    """All keys of `summary.json`."""
+    rows = [
+        (f"`{place}{metric.key}`", metric.label, metric.meaning)
+        for place, block in BLOCKS.items()
+        for metric in block.values()
+    ]
+    return _table(("key", "name", "meaning"), rows)
 
 
-def page(name: str) -> str:
-    """The text of a page, with new tables.
+SETTINGS = """# Settings
 
-    Args:
-      name: of its file.
-    """
-    written, mark, _ = (DOCS / name).read_text(encoding="utf-8").partition(MARK)
-    return f"{written}{mark}\n\n{TABLES[name]()}"
+Each setting is an option of `python -m jaxsense.train`, with `-` in place of `_`:
+
+    python -m jaxsense.train --arena.num-pois 4 --mission.no-redecides
+
+The name alone turns a setting on; `no-` before its last part turns it off. In Python, settings
+are frozen dataclasses: `dataclasses.replace(config, arena=dataclasses.replace(config.arena,
+num_pois=4))`. Defaults are those of preset `default`; [the end of this page](#presets) lists
+what the other presets change. Settings marked † only enter the arithmetic: changing them
+recompiles nothing, and JAX may trace them.
+"""
+API = """# API
+
+Every public name, with the first sentence of its docstring. [The reference](../reference.rst)
+has the rest.
+
+## What is stable
+
+Versions follow [Semantic Versioning](https://semver.org). These change only with a new minor
+version as long as the major version is 0, and after that only with a new major version:
+
+- the names on this page, the arguments of the functions and the fields of the classes behind
+  them;
+- `jaxsense.train.main`, `jaxsense.evaluate.main`, and `main` and `load` of `jaxsense.export`;
+- `read` and `RecordedLooks` of `jaxsense.run.recordings`;
+- `reset` and `run_episode` of `jaxsense.dqn.episodes`, and `best` and `Trained` of
+  `jaxsense.dqn.policies`;
+- [settings](settings.md), [commands](../getting-started.md#first-steps) and their options;
+- the keys of [`summary.json`](summary.md);
+- the names and the content of [tasks](../tasks.md): a task that changes gets a new version in
+  its name;
+- what [an exported archive](../interfaces.md#export) holds.
+
+Everything else may change in any version. `jaxsense.load` refuses a run that it cannot read.
+"""
+SUMMARY = """# Keys of summary.json
+
+The keys are a public contract. A run's `report.html` explains those that the run has. [Getting
+started](../getting-started.md#summaryjson) says how to read them.
+"""
+OUTSIDE = {
+    "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
+    "benchmarks.md": "benchmarks/RESULTS.md",
+}
+"""Pages of the site that are files outside of `docs`."""
 
 
-def main() -> None:
-    """Writes the pages."""
-    for name in TABLES:
-        (DOCS / name).write_text(page(name), encoding="utf-8")
+def _outside(file: str) -> str:
+    """A file outside of `docs`, with links that work on the site."""
+    text = (DOCS.parent / file).read_text(encoding="utf-8")
+    text = re.sub(r"\]\((?:\.\./)?docs/", "](../", text)
+    text = re.sub(r"\]\((?:\.\./)?jaxsense/", "](../jaxsense/", text)
+    for page, other in OUTSIDE.items():
+        text = text.replace(f"]({other}", f"]({page}")
+    return text
 
 
-if __name__ == "__main__":
-    main()
+PAGES = {
+    "settings.md": lambda: f"{SETTINGS}\n{settings()}",
+    "api.md": lambda: f"{API}\n{api()}",
+    "summary.md": lambda: f"{SUMMARY}\n{keys()}",
+    **{page: functools.partial(_outside, file) for page, file in OUTSIDE.items()},
+}
+"""Each page of `docs/site`, and what makes it."""
+
+
+def write() -> None:
+    """Writes the pages that have changed, so that Sphinx reads only those again."""
+    folder = DOCS / "site"
+    folder.mkdir(exist_ok=True)
+    for name, text in ((name, make()) for name, make in PAGES.items()):
+        if not (folder / name).exists() or (folder / name).read_text(encoding="utf-8") != text:
+            (folder / name).write_text(text, encoding="utf-8")

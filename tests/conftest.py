@@ -33,7 +33,6 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 import filelock
 import pytest
 import xdist
-from skips import pytest_make_collect_report, pytest_runtest_makereport  # noqa: F401
 
 # A script may have started this in the background, where Ctrl-C is not for it.
 signal.signal(signal.SIGINT, signal.default_int_handler)

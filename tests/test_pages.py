@@ -75,7 +75,7 @@ def test_the_front_page_leads_to_every_page():
 def test_dead_links_are_found():
     page = (
         "# A `b`, c\n[x](#a-b-c) [`x`](#jaxsense.x) [](../README.md) [x](no.md)\n"
-        "[x](../README.md#results) [x](../README.md#no) [x](https://a.b/c) `[x](y)`\n"
+        "[x](../README.md#quickstart) [x](../README.md#no) [x](https://a.b/c) `[x](y)`\n"
     )
     found = [*dead_links(ROOT / "docs" / "index.md", page)]
     expected = [("code", "#jaxsense.x"), ("", "../README.md"), ("x", "no.md")]

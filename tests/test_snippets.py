@@ -1,4 +1,4 @@
-"""The snippets of `docs/extending.md` and `docs/recorded.md` run and do what the pages say."""
+"""The snippets of `docs/extending.md` and `docs/robot.md` run and do what the pages say."""
 
 import dataclasses
 import importlib
@@ -15,7 +15,7 @@ from onnx import numpy_helper
 from smoke import save_models
 
 import jaxsense
-from jaxsense import PRESETS, sim, train
+from jaxsense import PRESETS, export, sim, train
 from jaxsense.run.rundir import RunDirectory, Settings
 
 ROOT = Path(__file__).parent.parent
@@ -26,8 +26,8 @@ def snippets(page):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, LOOKS, SCORE = snippets("extending.md")
-COMPARED, RETRAINED, ARCHIVED = snippets("recorded.md")
+PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, FUSION, SCORE = snippets("extending.md")
+PLAYED, RESAMPLED, LOOKS, COMPARED, RETRAINED, ARCHIVED = snippets("robot.md")
 
 
 @pytest.fixture
@@ -97,6 +97,13 @@ def test_looks_fill_the_map(recording, tmp_path, monkeypatch, capsys):
     assert len(belief) == len(config.arena.classes)
 
 
+def test_a_fusion_reads_class_probabilities(capsys):
+    found = run(FUSION)
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    probabilities = found["models"].fusion.class_probabilities(found["belief"])
+    assert np.isclose(probabilities.sum(), 1)
+
+
 @pytest.mark.slow  # compiles missions of five policies
 def test_a_policy_is_scored_in_missions(capsys):
     run(SCORE)
@@ -116,6 +123,15 @@ def test_recorded_scans_are_compared(recording, tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in printed] == ["camera", "lidar"]
     assert Path("recorded.npz.residuals.svg").exists()
+
+
+def test_an_archive_reads_scans(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    export.main(["pretrained:noisy", "--out", "robot.zip"])
+    capsys.readouterr()
+    assert run(PLAYED, RESAMPLED)["scan"].shape == (683,)
+    printed = "False {'cylinder': 0.5, 'cube': 0.5}\n(683,) True\nFalse\n"
+    assert capsys.readouterr().out == printed
 
 
 def test_a_detector_is_retrained_with_labelled_looks(recording, tmp_path, monkeypatch):

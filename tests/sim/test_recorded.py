@@ -181,7 +181,7 @@ def test_noise_is_fitted_to_scans(measured):
     found = recorded.fit_noise(LidarConfig(), ANGLES, ranges)
     assert found.range_noise == pytest.approx(noise.range_noise, abs=0.0005)
     assert found.range_noise_growth == pytest.approx(noise.range_noise_growth, abs=0.0002)
-    assert 0.1 < found.mixed_pixels < 0.145  # an upper bound, see docs/recorded.md
+    assert 0.1 < found.mixed_pixels < 0.145  # an upper bound, see docs/robot.md
     assert found.dropout == pytest.approx(noise.dropout, abs=0.001)
     assert replace(noise, range_noise=0.01) == replace(
         found, range_noise=0.01, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01

@@ -1,7 +1,6 @@
 """The one table of metrics: every key that it names exists, and every key is named."""
 
 import json
-from pathlib import Path
 
 import pytest
 from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
@@ -16,7 +15,6 @@ RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
 RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
 RARE |= {f"evaluations.NAME.origin.{key}" for key in ORIGIN}
 OF_ALL_NAIVE = {key for key in KEYS if ".of_naive." in key}
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 def keys(value, key=""):
@@ -48,16 +46,6 @@ def test_every_rare_key_is_somewhere():
         key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)
     }
     assert RARE | OF_ALL_NAIVE <= found <= KEYS
-
-
-def test_the_page_about_runs_shows_this_table():
-    rows = ["| key | name | meaning |", "| --- | --- | --- |"]
-    for place, block in BLOCKS.items():
-        for metric in block.values():
-            meaning = metric.meaning and f" {metric.meaning}"
-            rows.append(f"| `{place}{metric.key}` | {metric.label} |{meaning} |")
-    page = (DOCS / "getting-started.md").read_text(encoding="utf-8")
-    assert "\n\n" + "\n".join(rows) + "\n\n" in page
 
 
 @pytest.mark.parametrize(
