@@ -6,46 +6,75 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import measure, peers
-from benchmarks.maps import MODALITY, Task, untrained_task
+from benchmarks.jmvae import random_bank
 from benchmarks.measure import Options, Row, Side
-from jaxsense import PRESETS, make_mdp
+from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import training
+from jaxsense.dqn.environments import MapEnvironment
 from jaxsense.dqn.map_mdp import MapMdp
 
+MODALITY = 0
+"""The agent looks with the camera."""
+NUM_STARTS = 8192
+"""Prepared starts of episodes: a new one in each step would cost more than the step."""
 _UNIT = "env-steps/s"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """Q-learning on the map MDP with stored detections.
+
+    Attributes:
+      config: all settings, including our own DQN's.
+      models: the networks.
+      bank: for each modality `[C, S, D_m]` detections.
+    """
+
+    config: Config
+    models: Models
+    bank: tuple[jax.Array, ...]
+
+    @property
+    def mdp(self) -> MapMdp:
+        """The MDP."""
+        return make_mdp(self.config, self.models, Bank(self.bank)).map
+
+    @property
+    def environment(self) -> MapEnvironment:
+        """What our DQN learns in."""
+        return self.models.agent.environment(self.mdp, MODALITY)
+
+
+def untrained_task(dqn: DqnConfig, samples: int = 10000) -> Task:
+    """A task of the real sizes with random networks and detections: as fast as a trained one.
+
+    Args:
+      dqn: settings of our own DQN.
+      samples: detections of each class by each sensor.
+    """
+    config = dataclasses.replace(PRESETS["default"], dqn=dqn)
+    sizes = make_jmvae(config).feature_sizes
+    bank = random_bank(jax.random.key(1), sizes, len(config.arena.classes), samples)
+    return Task(config, init(jax.random.key(0), config), bank)
 
 
 def dqn_rejax(options: Options) -> Row:
     """Against rejax, with as many environments and the same batch, network and replay."""
-    task = untrained_task(_settings(options))
-    peer = peers.load("rejax", options)
+    task, peer = untrained_task(_settings(options)), peers.load("rejax", options.peers)
     theirs = [peer.throughput(task, options)] if peer else []
-    return measure.compare(
-        "dqn_rejax",
-        _UNIT,
-        [_our_side(task, task.mdp)],
-        theirs,
-        options,
-        peer="rejax DQN",
-        packages=("rejax",),
-    )
+    names = {"peer": "rejax DQN", "packages": ("rejax",)}
+    ours = [_our_side(task, task.mdp)]
+    return measure.compare("dqn_rejax", _UNIT, ours, theirs, options, **names)
 
 
 def dqn_sb3(options: Options) -> Row:
     """Against Stable-Baselines3, which steps one environment in NumPy."""
-    task = untrained_task(_settings(options))
-    peer = peers.load("sb3", options)
+    task, peer = untrained_task(_settings(options)), peers.load("sb3", options.peers)
     theirs = peer.throughputs(task, options) if peer else []
-    return measure.compare(
-        "dqn_sb3",
-        _UNIT,
-        [_our_side(task, task.mdp)],
-        theirs,
-        options,
-        peer="Stable-Baselines3 DQN",
-        packages=("stable-baselines3", "torch"),
-    )
+    names = {"peer": "Stable-Baselines3 DQN", "packages": ("stable-baselines3", "torch")}
+    ours = [_our_side(task, task.mdp)]
+    return measure.compare("dqn_sb3", _UNIT, ours, theirs, options, **names)
 
 
 def dqn_live(options: Options) -> Row:
@@ -57,16 +86,15 @@ def dqn_live(options: Options) -> Row:
 
 def dqn_seeds(options: Options) -> Row:
     """Many seeds of the agents of both modalities in one program, with the paper's settings."""
-    task = untrained_task(_settings(options))
-    is_accelerated = jax.default_backend() != "cpu"
-    num_seeds = 64 if is_accelerated and not options.quick else 2
+    settings, is_accelerated = _settings(options), jax.default_backend() != "cpu"
     if not options.quick:
-        paper = PRESETS["paper"].dqn
+        settings = PRESETS["paper"].dqn
         # On a CPU a twentieth of the epochs: the rate is the same.
-        epochs = paper.epochs if is_accelerated else paper.epochs // 20
-        task = untrained_task(dataclasses.replace(paper, epochs=epochs))
-    settings, modalities = task.config.dqn, jnp.arange(len(task.config.modalities))
-    agent = task.models.agent
+        epochs = settings.epochs // (1 if is_accelerated else 20)
+        settings = dataclasses.replace(settings, epochs=epochs)
+    task = untrained_task(settings)
+    num_seeds = 64 if is_accelerated and not options.quick else 2
+    modalities, agent = jnp.arange(len(task.config.modalities)), task.models.agent
 
     def train(keys: jax.Array, mdp: MapMdp):
         def of_one(key: jax.Array, modality: jax.Array):
@@ -85,26 +113,12 @@ def dqn_seeds(options: Options) -> Row:
 
 def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     """512 environments, one gradient step of batch 512 for each step of all of them."""
+    settings = DqnConfig(observe="bank", num_envs=512, epochs=epochs, chunk=100, updates=1)
+    settings = dataclasses.replace(settings, batch=512, replay_capacity=131072)
     if options.quick:
-        return DqnConfig(
-            observe="bank",
-            num_envs=16,
-            epochs=4,
-            chunk=2,
-            updates=1,
-            batch=16,
-            replay_capacity=1024,
-            num_starts=16,
-        )
-    return DqnConfig(
-        observe="bank",
-        num_envs=512,
-        epochs=epochs,
-        chunk=100,
-        updates=1,
-        batch=512,
-        replay_capacity=131072,
-    )
+        few = {"num_envs": 16, "batch": 16, "num_starts": 16, "replay_capacity": 1024}
+        settings = dataclasses.replace(settings, **few, epochs=4, chunk=2)
+    return settings
 
 
 def _our_side(task: Task, mdp: MapMdp) -> Side:
