@@ -1,18 +1,24 @@
-"""Q-learning on the map MDP: environment steps per second, with a gradient step per vector step."""
+"""Q-learning: environment steps per second on the map MDP, and our DQN as a learner in tasks."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from benchmarks import measure, peers
 from benchmarks.jmvae import random_bank
 from benchmarks.measure import Options, Row, Side
-from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp
+from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp, tasks
 from jaxsense.config import DqnConfig
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Key
 from jaxsense.dqn import training
-from jaxsense.dqn.environments import MapEnvironment
+from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.run import devices
+from jaxsense.tasks.score import Policy
 
 MODALITY = 0
 """The agent looks with the camera."""
@@ -41,9 +47,64 @@ class Task:
         return make_mdp(self.config, self.models, Bank(self.bank)).map
 
     @property
-    def environment(self) -> MapEnvironment:
+    def environment(self) -> Environment[PyTree]:
         """What our DQN learns in."""
         return self.models.agent.environment(self.mdp, MODALITY)
+
+
+@dataclasses.dataclass(frozen=True)
+class Dqn:
+    """`jaxsense.dqn.train` as a learner in tasks, with the network of the preset.
+
+    Attributes:
+      discount: of a step.
+      discount_of_a_second: in place of that of a step, in a team.
+      updates: gradient steps for each step of all environments.
+      replay: transitions.
+      exploration: share of the training until a hundredth of the first exploration is left.
+      target_period: steps of all environments.
+    """
+
+    name = "our DQN"
+    packages = ()
+    discount: float = 0.5
+    discount_of_a_second: float = 0.99
+    num_envs: int = 128
+    updates: int = 8
+    batch: int = 256
+    replay: int = 65536
+    learning_rate: float = 1e-3
+    exploration: float = 0.5
+    target_period: int = 20
+
+    def train(self, task: tasks.Task, seeds: Sequence[int], steps: int) -> dict[int, Policy]:
+        """Trains all seeds in one program."""
+        discounts = {"step": self.discount, "second": self.discount_of_a_second}
+        agent = task.models.agent.with_discount(**discounts)
+        epochs = max(1, steps // self.num_envs)
+        settings = DqnConfig(
+            num_envs=self.num_envs,
+            epochs=epochs,
+            chunk=epochs,
+            updates=self.updates,
+            batch=self.batch,
+            replay_capacity=self.replay,
+            learning_rate=self.learning_rate,
+            epsilon_decay=0.01 ** (1 / (self.exploration * epochs)),
+            target_period=self.target_period,
+            num_starts=NUM_STARTS,
+        )
+
+        def train(key: Key, task: tasks.Task) -> Params:
+            return training.train(key, task.learning(agent), settings)[0].params
+
+        options = devices.compiler_options(runs_long=True)
+        of_seeds = jax.jit(jax.vmap(train, (0, None)), compiler_options=options)
+        params = jax.device_get(of_seeds(jax.vmap(jax.random.key)(jnp.array(seeds)), task))
+        return {
+            seed: tasks.greedy(task, agent, jax.tree.map(lambda x: x[i], params))  # noqa: B023
+            for i, seed in enumerate(seeds)
+        }
 
 
 def untrained_task(dqn: DqnConfig, samples: int = 10000) -> Task:
