@@ -102,15 +102,11 @@ def test_the_table_shows_means_and_intervals():
 
 def check(params, data):
     found = digits.figures(jax.random.key(0), params, data, BUDGET, samples=20)
-    assert [*found] == [
-        *("log-likelihood", "accuracy all", "accuracy noise", "accuracy a", "accuracy b"),
-        *("accuracy, 1 missing", "accuracy, 2 missing"),
-    ]
+    accuracies = [f"accuracy {name}" for name in ("all", *data.names)]
+    assert [*found] == ["log-likelihood", *accuracies]
     # Two views show the label, the other does not; chance is 1/3.
     assert found["accuracy all"] > 0.8
     assert found["accuracy noise"] < 0.6
-    parts = [found[f"accuracy {name}"] for name in data.names]
-    assert found["accuracy, 2 missing"] == pytest.approx(np.mean(parts))
     # The best that a model that knows no connection can reach: N(0, 1) for each feature.
     assert found["log-likelihood"] > -0.5 * 9 * (1 + math.log(2 * math.pi))
 
@@ -130,7 +126,7 @@ def test_figures_of_multivae_are_those_of_its_networks(data):
     theirs, names = peer.network(model), model.modalities
     params = jax.tree.map(jnp.asarray, peer.as_params(theirs, model))
     inputs = {name: peer.torch.tensor(x) for name, x in zip(names, data.test, strict=True)}
-    for seen in ((1,), (0, 2), (0, 1, 2)):
+    for seen in ((1,), (0, 1, 2)):
         given = tuple(x if m in seen else None for m, x in enumerate(data.test))
         ours = jax.vmap(vae.encode, (None, None, 0))(params, model, given)[0]
         chosen = [names[m] for m in seen]
