@@ -119,7 +119,10 @@ def table(summaries: Iterable[Summary]) -> str:
     seeds = [seed for group in presets.values() for seed in group]
     policies = dict.fromkeys(name for seed in seeds for name in summary.cases(seed["mission"]))
     figures = [*LEARNED, *(figure for policy in policies for figure in _of_missions(policy))]
-    heads = [f"`{preset}`, {len(group)} seeds" for preset, group in presets.items()]
+    heads = [
+        f"`{preset}`, {len(group)} seed{'s' * (len(group) > 1)}"
+        for preset, group in presets.items()
+    ]
     rows = [["", *heads], ["---"] * (1 + len(heads))]
     rows += [[each.label, *map(each.cell, presets.values())] for each in figures]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

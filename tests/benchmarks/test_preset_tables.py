@@ -9,7 +9,7 @@ from summaries import SUMMARY
 from benchmarks import presets
 
 EXPECTED = """\
-|  | `smoke`, 2 seeds | `paper`, 1 seeds |
+|  | `smoke`, 2 seeds | `paper`, 1 seed |
 | --- | --- | --- |
 | detectors' accuracy | 0.9800 to 0.9995 | 0.9995 |
 | cells of Table I, of 9 | 8 to 9 | 8 |
