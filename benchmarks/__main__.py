@@ -12,10 +12,10 @@ import rich.console
 import rich.table
 
 from benchmarks import ROWS
-from benchmarks.measure import Options, Row, require_commit, require_known, reserve
-from jaxsense.config.checks import check_fields
+from benchmarks.measure import Options, Row, reserve
+from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
-from jaxsense.run import cli, devices, version
+from jaxsense.run import cli, devices
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -30,23 +30,19 @@ class Arguments:
     peers: bool = False
     """Also measure other libraries on the same work, in turn."""
     json: Path | None = None
-    """File to write; must be new and, unless sizes are tiny, the source without changes since its
-    commit."""
+    """File to write; must be new."""
     quick: bool = False
     """Use tiny sizes, to check that everything runs."""
 
     def __post_init__(self):
         check_fields(self)
+        require(set(self.names) <= set(ROWS), self, "names", f"must be some of {', '.join(ROWS)}")
 
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    require_known(PROGRAM, "name", arguments.names, ROWS)
-    if arguments.json is not None and not arguments.quick:
-        require_commit(PROGRAM)
-    reserve(PROGRAM, "json", arguments.json)
-    commit = version.commit()
+    reserve(PROGRAM, arguments.json)
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", devices.cores())
@@ -61,9 +57,8 @@ def main(argv: list[str] | None = None) -> None:
             rows.append(ROWS[name](Options(arguments.peers, arguments.quick)))
         if arguments.json is not None:
             # After each row, so that what was measured before a failure is kept.
-            arguments.json.write_text(
-                json.dumps([row.as_json(commit) for row in rows], indent=2) + "\n", encoding="utf-8"
-            )
+            text = json.dumps([row.as_json() for row in rows], indent=2)
+            arguments.json.write_text(f"{text}\n", encoding="utf-8")
     _print_table(console, rows)
 
 
@@ -81,13 +76,15 @@ def _print_table(console: rich.console.Console, rows: list[Row]) -> None:
             "" if row.theirs is None else bound + _number(row.theirs),
             "" if row.ratio is None else f"{bound}{_number(row.ratio)} x",
             f"{row.compile_s:.1f}",
-            row.device,
+            row.origin["device"],
             str(row.batch),
         )
         for unit, value in row.also.items():
             table.add_row("", unit, _number(value))
     console.print(table)
-    versions = {name: version for row in rows for name, version in row.versions.items()}
+    versions: dict[str, str] = {}
+    for row in rows:
+        versions |= row.origin["versions"]
     console.print(", ".join(f"{name} {version}" for name, version in versions.items()))
 
 

@@ -1,51 +1,141 @@
-"""Q-learning on the map MDP: environment steps per second, with a gradient step per vector step."""
+"""Q-learning: environment steps per second on the map MDP, and our DQN as a learner in tasks."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from benchmarks import measure, peers
-from benchmarks.maps import MODALITY, Task, untrained_task
+from benchmarks.jmvae import random_bank
 from benchmarks.measure import Options, Row, Side
-from jaxsense import PRESETS, make_mdp
+from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp, tasks
 from jaxsense.config import DqnConfig
+from jaxsense.core.networks import Params
+from jaxsense.core.types import Key
 from jaxsense.dqn import training
+from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.run import devices
+from jaxsense.tasks.score import Policy
 
+MODALITY = 0
+"""The agent looks with the camera."""
+NUM_STARTS = 8192
+"""Prepared starts of episodes: a new one in each step would cost more than the step."""
 _UNIT = "env-steps/s"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """Q-learning on the map MDP with stored detections.
+
+    Attributes:
+      config: all settings, including our own DQN's.
+      models: the networks.
+      bank: for each modality `[C, S, D_m]` detections.
+    """
+
+    config: Config
+    models: Models
+    bank: tuple[jax.Array, ...]
+
+    @property
+    def mdp(self) -> MapMdp:
+        """The MDP."""
+        return make_mdp(self.config, self.models, Bank(self.bank)).map
+
+    @property
+    def environment(self) -> Environment[PyTree]:
+        """What our DQN learns in."""
+        return self.models.agent.environment(self.mdp, MODALITY)
+
+
+@dataclasses.dataclass(frozen=True)
+class Dqn:
+    """`jaxsense.dqn.train` as a learner in tasks, with the network of the preset.
+
+    Attributes:
+      discount: of a step.
+      discount_of_a_second: in place of that of a step, in a team.
+      updates: gradient steps for each step of all environments.
+      replay: transitions.
+      exploration: share of the training until a hundredth of the first exploration is left.
+      target_period: steps of all environments.
+    """
+
+    name = "our DQN"
+    packages = ()
+    discount: float = 0.5
+    discount_of_a_second: float = 0.99
+    num_envs: int = 128
+    updates: int = 8
+    batch: int = 256
+    replay: int = 65536
+    learning_rate: float = 1e-3
+    exploration: float = 0.5
+    target_period: int = 20
+
+    def train(self, task: tasks.Task, seeds: Sequence[int], steps: int) -> dict[int, Policy]:
+        """Trains all seeds in one program."""
+        discounts = {"step": self.discount, "second": self.discount_of_a_second}
+        agent = task.models.agent.with_discount(**discounts)
+        epochs = max(1, steps // self.num_envs)
+        settings = DqnConfig(
+            num_envs=self.num_envs,
+            epochs=epochs,
+            chunk=epochs,
+            updates=self.updates,
+            batch=self.batch,
+            replay_capacity=self.replay,
+            learning_rate=self.learning_rate,
+            epsilon_decay=0.01 ** (1 / (self.exploration * epochs)),
+            target_period=self.target_period,
+            num_starts=NUM_STARTS,
+        )
+
+        def train(key: Key, task: tasks.Task) -> Params:
+            return training.train(key, task.learning(agent), settings)[0].params
+
+        options = devices.compiler_options(runs_long=True)
+        of_seeds = jax.jit(jax.vmap(train, (0, None)), compiler_options=options)
+        params = jax.device_get(of_seeds(jax.vmap(jax.random.key)(jnp.array(seeds)), task))
+        return {
+            seed: tasks.greedy(task, agent, jax.tree.map(lambda x: x[i], params))  # noqa: B023
+            for i, seed in enumerate(seeds)
+        }
+
+
+def untrained_task(dqn: DqnConfig, samples: int = 10000) -> Task:
+    """A task of the real sizes with random networks and detections: as fast as a trained one.
+
+    Args:
+      dqn: settings of our own DQN.
+      samples: detections of each class by each sensor.
+    """
+    config = dataclasses.replace(PRESETS["default"], dqn=dqn)
+    sizes = make_jmvae(config).feature_sizes
+    bank = random_bank(jax.random.key(1), sizes, len(config.arena.classes), samples)
+    return Task(config, init(jax.random.key(0), config), bank)
 
 
 def dqn_rejax(options: Options) -> Row:
     """Against rejax, with as many environments and the same batch, network and replay."""
-    task = untrained_task(_settings(options))
-    peer = peers.load("rejax", options)
+    task, peer = untrained_task(_settings(options)), peers.load("rejax", options.peers)
     theirs = [peer.throughput(task, options)] if peer else []
-    return measure.compare(
-        "dqn_rejax",
-        _UNIT,
-        [_our_side(task, task.mdp)],
-        theirs,
-        options,
-        peer="rejax DQN",
-        packages=("rejax",),
-    )
+    names = {"peer": "rejax DQN", "packages": ("rejax",)}
+    ours = [_our_side(task, task.mdp)]
+    return measure.compare("dqn_rejax", _UNIT, ours, theirs, options, **names)
 
 
 def dqn_sb3(options: Options) -> Row:
     """Against Stable-Baselines3, which steps one environment in NumPy."""
-    task = untrained_task(_settings(options))
-    peer = peers.load("sb3", options)
+    task, peer = untrained_task(_settings(options)), peers.load("sb3", options.peers)
     theirs = peer.throughputs(task, options) if peer else []
-    return measure.compare(
-        "dqn_sb3",
-        _UNIT,
-        [_our_side(task, task.mdp)],
-        theirs,
-        options,
-        peer="Stable-Baselines3 DQN",
-        packages=("stable-baselines3", "torch"),
-    )
+    names = {"peer": "Stable-Baselines3 DQN", "packages": ("stable-baselines3", "torch")}
+    ours = [_our_side(task, task.mdp)]
+    return measure.compare("dqn_sb3", _UNIT, ours, theirs, options, **names)
 
 
 def dqn_live(options: Options) -> Row:
@@ -57,16 +147,15 @@ def dqn_live(options: Options) -> Row:
 
 def dqn_seeds(options: Options) -> Row:
     """Many seeds of the agents of both modalities in one program, with the paper's settings."""
-    task = untrained_task(_settings(options))
-    is_accelerated = jax.default_backend() != "cpu"
-    num_seeds = 64 if is_accelerated and not options.quick else 2
+    settings, is_accelerated = _settings(options), jax.default_backend() != "cpu"
     if not options.quick:
-        paper = PRESETS["paper"].dqn
+        settings = PRESETS["paper"].dqn
         # On a CPU a twentieth of the epochs: the rate is the same.
-        epochs = paper.epochs if is_accelerated else paper.epochs // 20
-        task = untrained_task(dataclasses.replace(paper, epochs=epochs))
-    settings, modalities = task.config.dqn, jnp.arange(len(task.config.modalities))
-    agent = task.models.agent
+        epochs = settings.epochs // (1 if is_accelerated else 20)
+        settings = dataclasses.replace(settings, epochs=epochs)
+    task = untrained_task(settings)
+    num_seeds = 64 if is_accelerated and not options.quick else 2
+    modalities, agent = jnp.arange(len(task.config.modalities)), task.models.agent
 
     def train(keys: jax.Array, mdp: MapMdp):
         def of_one(key: jax.Array, modality: jax.Array):
@@ -85,26 +174,12 @@ def dqn_seeds(options: Options) -> Row:
 
 def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     """512 environments, one gradient step of batch 512 for each step of all of them."""
+    settings = DqnConfig(observe="bank", num_envs=512, epochs=epochs, chunk=100, updates=1)
+    settings = dataclasses.replace(settings, batch=512, replay_capacity=131072)
     if options.quick:
-        return DqnConfig(
-            observe="bank",
-            num_envs=16,
-            epochs=4,
-            chunk=2,
-            updates=1,
-            batch=16,
-            replay_capacity=1024,
-            num_starts=16,
-        )
-    return DqnConfig(
-        observe="bank",
-        num_envs=512,
-        epochs=epochs,
-        chunk=100,
-        updates=1,
-        batch=512,
-        replay_capacity=131072,
-    )
+        few = {"num_envs": 16, "batch": 16, "num_starts": 16, "replay_capacity": 1024}
+        settings = dataclasses.replace(settings, **few, epochs=4, chunk=2)
+    return settings
 
 
 def _our_side(task: Task, mdp: MapMdp) -> Side:

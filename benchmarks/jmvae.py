@@ -29,7 +29,7 @@ def jmvae(options: Options) -> Row:
 
     work, batch = steps * config.batch, config.batch
     ours = [measure.compiled(train, jax.random.key(1), bank, work=work, batch=batch)]
-    peer = peers.load("multivae", options)
+    peer = peers.load("multivae", options.peers)
     theirs = peer.sides(model, config, [np.asarray(x) for x in bank], options) if peer else []
     return measure.compare(
         "jmvae",

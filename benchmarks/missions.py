@@ -12,9 +12,8 @@ from benchmarks import measure
 from benchmarks.measure import Options, Row, Side
 from jaxsense import PRESETS, init, mission
 from jaxsense.config import Config
-from jaxsense.mission import Mission, MissionState
+from jaxsense.mission import MissionState
 from jaxsense.mission.rollout import rollout_batch
-from jaxsense.models import Models
 from jaxsense.run import batches, devices
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
@@ -116,19 +115,27 @@ def _go_on(
     """Some control periods of missions after their first seconds."""
     devices_of_sides, number = _sides(against_one)
     (batch,) = measure.batches(options, quick=4, cpu=(384,), accelerator=(number * accelerator,))
-    missions = playing(config, "naive", batch, _PERIODS)
+    scenario, models = mission.make_mission(config), init(jax.random.key(0), config)
+    policy = scenario.policy("naive")
 
-    def go_on(keys: jax.Array, states: MissionState) -> MissionState:
-        return missions.go_on(keys, missions.models, states)
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    def begin(keys: jax.Array) -> MissionState:
+        return jax.vmap(lambda key: mission.reset(key, scenario, models, policy))(keys)
+
+    def play(keys: jax.Array, states: MissionState, periods: int) -> MissionState:
+        return rollout_batch(keys, scenario, models, states, periods, 1)[0]
+
+    start_keys, keys_before, keys = (jax.random.split(jax.random.key(i), batch) for i in (1, 2, 3))
+    before = jax.jit(play, static_argnums=2, compiler_options=devices.compiler_options())
+    states = before(keys_before, begin(start_keys), PERIODS_BEFORE)
 
     def side(workers: Workers) -> Side:
-        args = missions.keys, missions.states
-        made = measure.compiled(
-            go_on, *args, work=0, batch=batch, workers=workers, wide_vectors=True
-        )
+        go_on = functools.partial(play, periods=_PERIODS)
+        options = {"batch": batch, "workers": workers, "wide_vectors": True}
+        made = measure.compiled(go_on, keys, states, work=0, **options)
         after = measure.joined(made.run())
         # Missions that have ended make no more steps.
-        return dataclasses.replace(made, work=int(np.sum(after.steps - missions.states.steps)))
+        return dataclasses.replace(made, work=int(np.sum(after.steps - states.steps)))
 
     ours, *theirs = map(side, devices_of_sides)
     peer = "one device" if against_one else None
@@ -171,63 +178,8 @@ def untrained(preset: str) -> Config:
     return dataclasses.replace(config, mission=settings)
 
 
-def of_many_pois(robots: tuple[str, ...] | None = None) -> Config:
-    """Settings of two robots, or others, among 16 PoIs in an arena of 6 m.
-
-    Args:
-      robots: see `Config.robots`.
-    """
+def of_many_pois() -> Config:
+    """Settings of two robots among 16 PoIs in an arena of 6 m."""
     config = untrained("team")
     arena = dataclasses.replace(config.arena, num_pois=16, side=6.0)
-    return dataclasses.replace(config, arena=arena, robots=robots)
-
-
-@dataclasses.dataclass(frozen=True)
-class Playing:
-    """Missions that are under way.
-
-    Attributes:
-      scenario: the mission.
-      models: its networks.
-      keys: `[B]` of the missions.
-      states: `[B]` of the missions.
-      steps: control periods of a call.
-    """
-
-    scenario: Mission
-    models: Models
-    keys: jax.Array
-    states: MissionState
-    steps: int
-
-    @property
-    def args(self) -> tuple[jax.Array, Models, MissionState]:
-        """Arguments of the program."""
-        return self.keys, self.models, self.states
-
-    def go_on(self, keys: jax.Array, models: Models, states: MissionState) -> MissionState:
-        """Runs `steps` control periods of all missions."""
-        return rollout_batch(keys, self.scenario, models, states, self.steps, 1)[0]
-
-    def compiled(self, options: devices.Options) -> jax.stages.Compiled:
-        """The program of `go_on`."""
-        return jax.jit(self.go_on).lower(*self.args).compile(options)
-
-
-def playing(config: Config, policy: str, batch: int, steps: int) -> Playing:
-    """Missions of untrained networks after their first seconds."""
-    scenario = mission.make_mission(config)
-    models = init(jax.random.key(0), config)
-    number = scenario.policy(policy)
-
-    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-    def begin(keys: jax.Array) -> MissionState:
-        reset = lambda key: mission.reset(key, scenario, models, number)  # noqa: E731
-        return jax.vmap(reset)(keys)
-
-    states = begin(jax.random.split(jax.random.key(1), batch))
-    keys = jax.random.split(jax.random.key(2), batch)
-    before = Playing(scenario, models, keys, states, PERIODS_BEFORE)
-    states = before.compiled(devices.compiler_options())(*before.args)
-    keys = jax.random.split(jax.random.key(3), batch)
-    return Playing(scenario, models, keys, states, steps)
+    return dataclasses.replace(config, arena=arena)

@@ -104,7 +104,7 @@ def _native(simulate: Callable[..., Callable[[], PyTree]], options: Options) -> 
 
 
 def _warp(options: Options) -> Sides | None:
-    warp = peers.load("mujoco_warp", options)
+    warp = peers.load("mujoco_warp", options.peers)
     if warp is None:
         return None
 

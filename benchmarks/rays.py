@@ -41,7 +41,7 @@ def rays(options: Options) -> Row:
 def rays_warp(options: Options, row: str = "rays_warp", has_tree: bool = False) -> Row:
     """The same rays on one device against MuJoCo Warp's, which try all geoms."""
     world, scenes, ours = _our_sides(options, devices.start(1))
-    warp, theirs = peers.load("mujoco_warp", options), []
+    warp, theirs = peers.load("mujoco_warp", options.peers), []
     if warp is not None:
         cast = functools.partial(warp.cast, has_tree=has_tree)
         theirs = [_warp_side(cast, world, some) for some in scenes]

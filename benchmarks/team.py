@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import measure
-from benchmarks.maps import untrained_task
+from benchmarks.dqn import untrained_task
 from benchmarks.measure import Options, Row
 from jaxsense import PRESETS, Bank, init, make_mdp
 from jaxsense.dqn import team_mdp as teams

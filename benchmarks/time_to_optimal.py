@@ -1,27 +1,114 @@
 """Time from nothing compiled to a policy within a hundredth of the optimal return."""
 
 import concurrent.futures
+import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import optax
 
-from benchmarks import measure, peers
-from benchmarks.maps import MODALITY, Examiner, Learner, Task
+from benchmarks import peers
+from benchmarks.dqn import MODALITY, Task
 from benchmarks.measure import Options, Row
-from benchmarks.trained import trained_task
-from jaxsense.dqn import training
+from jaxsense import PRESETS, init, learn
+from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
+from jaxsense.dqn import episodes, policies, training
+from jaxsense.dqn.episodes import Start
+from jaxsense.dqn.policies import Known
+from jaxsense.dqn.reference import reference
 from jaxsense.run import devices
 
 _LONGEST = 60.0  # s that we may take
 _MOST_TIMES = 20  # our time, after which a peer is stopped
+_SHARE = 0.99  # of the optimal return, which counts as optimal
+_CONFIG = dataclasses.replace(
+    PRESETS["default"],
+    detector=DetectorConfig(num_scans=24576, num_held_out=3 * 4096, steps=1500, batch=256),
+    jmvae=JmvaeConfig(samples_per_class=4096, steps=2000),
+    dqn=DqnConfig(
+        observe="bank",
+        epochs=400,
+        chunk=20,
+        updates=8,
+        batch=256,
+        replay_capacity=65536,
+        epsilon_decay=0.98,
+        target_period=10,
+    ),
+)
+_QUICK = dataclasses.replace(
+    PRESETS["smoke"],
+    detector=DetectorConfig(num_scans=384, num_held_out=3 * 64, steps=20, batch=32),
+    jmvae=JmvaeConfig(restarts=1, samples_per_class=64, steps=20, batch=32),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """One that trains, a chunk at a time, and compiles what it needs when first called.
+
+    Attributes:
+      start: `() -> state`.
+      go_on: `(state) -> state` after a chunk.
+      as_params: `(state) -> params` of a Q-network of ours.
+    """
+
+    start: Callable[[], Any]
+    go_on: Callable[[Any], Any]
+    as_params: Callable[[Any], optax.Params]
+
+
+class Examiner:
+    """Tells whether a Q-network is near the optimum, from whole episodes from fixed starts.
+
+    Attributes:
+      target: mean return to reach.
+    """
+
+    def __init__(self, task: Task, num_starts: int):
+        """Compiles everything, and plays the optimal policy, on the task's bank."""
+        mdp, exact, agent = task.mdp, task.models.bayes, task.models.agent
+        reset_key, play_key = jax.random.split(jax.random.key(5))
+        reset = jax.jit(jax.vmap(lambda key: episodes.reset(key, mdp, exact)))
+        self._starts = reset(jax.random.split(reset_key, num_starts))
+        optimal = reference(jax.random.key(0), mdp, MODALITY, task.models, exact.labels)
+
+        def learned(params: optax.Params, known: Known, classes: jax.Array) -> jax.Array:
+            del classes
+            return agent.values(params, agent.observe(known.belief, known.team, known.robot))
+
+        def mean_return(
+            values: Callable[[Known, jax.Array], jax.Array], starts: Start
+        ) -> jax.Array:
+            def play(key: jax.Array, start: Start) -> jax.Array:
+                def act(key: jax.Array, known: Known) -> jax.Array:
+                    del key
+                    return policies.best(values(known, start.state.classes))
+
+                return episodes.run_episode(key, mdp, exact, act, start, MODALITY)[0]
+
+            return jnp.mean(jax.vmap(play)(jax.random.split(play_key, num_starts), starts))
+
+        def learned_return(params: optax.Params, starts: Start) -> jax.Array:
+            return mean_return(functools.partial(learned, params), starts)
+
+        self.target = _SHARE * float(jax.jit(lambda x: mean_return(optimal, x))(self._starts))
+        example = agent.init(jax.random.key(0))
+        self._learned_return = jax.jit(learned_return).lower(example, self._starts).compile()
+
+    def passes(self, params: optax.Params) -> bool:
+        """Whether the policy of a Q-network reaches the target."""
+        return float(self._learned_return(params, self._starts)) >= self.target
 
 
 def time_to_optimal_rejax(options: Options) -> Row:
     """Against rejax, the best of several settings."""
-    peer = peers.load("rejax", options)
+    peer = peers.load("rejax", options.peers)
 
     def measure_peer(task: Task, examiner: Examiner, limit: float) -> tuple[float, bool]:
         def once(settings: Any) -> tuple[bool, float]:
@@ -37,7 +124,7 @@ def time_to_optimal_rejax(options: Options) -> Row:
 
 def time_to_optimal_sb3(options: Options) -> Row:
     """Against Stable-Baselines3."""
-    peer = peers.load("sb3", options)
+    peer = peers.load("sb3", options.peers)
 
     def measure_peer(task: Task, examiner: Examiner, limit: float) -> tuple[float, bool]:
         return peer.time_to(task, examiner.passes, limit)
@@ -55,30 +142,48 @@ def _row(
     packages: tuple[str, ...],
 ) -> Row:
     """Ours, and with `theirs(task, examiner, limit) -> (seconds, was stopped)` the peer's."""
-    task, examiner = trained_task(options.quick)
+    task, examiner = _trained_task(options.quick)
     longest = 0.0 if options.quick else _LONGEST
     ours, is_stopped = _median_time(lambda: _learner(task), examiner, longest, options)
     if is_stopped and not options.quick:
         raise RuntimeError(f"no policy within a hundredth of the optimum after {ours:.0f} s")
-    limit = 0.0 if options.quick else _MOST_TIMES * ours
-    their_time, is_bound = theirs(task, examiner, limit) if theirs else (None, False)
-    return measure.make_row(
+    their_time, is_bound = None, False
+    if theirs is not None:
+        their_time, is_bound = theirs(task, examiner, 0.0 if options.quick else _MOST_TIMES * ours)
+    return Row(
         f"time_to_optimal_{against}",
         "s",
         ours,
-        theirs=their_time,
+        _compile_s(task),
+        task.config.dqn.num_envs,
         peer=peer,
+        theirs=their_time,
         packages=packages,
-        compile_s=_compile_s(task),
-        batch=task.config.dqn.num_envs,
         is_bound=is_bound,
     )
+
+
+@functools.cache
+def _trained_task(quick: bool) -> tuple[Task, Examiner]:
+    """The map MDP on detections of trained detectors, and its examination on detections apart."""
+    config = _QUICK if quick else _CONFIG
+    train = jax.jit(lambda key: learn(key, config, until="look_values").outputs)
+    outputs = train(jax.random.key(6))
+    trained = dataclasses.replace(
+        init(jax.random.key(6), config),
+        fusion=outputs["fusion"],
+        jmvae=outputs["best_jmvae"],
+        look_values=outputs["look_values"],
+    )
+    found = outputs["detections"]
+    examiner = Examiner(Task(config, trained, found.held_out), 32 if quick else 4096)
+    return Task(config, trained, found.bank), examiner
 
 
 def _learner(task: Task) -> Learner:
     """Our own training, compiled as in a run: side by side."""
     settings = task.config.dqn
-    learning = task.models.agent.environment(task.mdp, MODALITY)
+    learning = task.environment
 
     def start(key: jax.Array):
         init_key, start_key, key = jax.random.split(key, 3)

@@ -1,25 +1,20 @@
-"""Others who do the same, each behind an adapter; none of them is needed to measure ourselves."""
+"""Other libraries that do the same, a module for each; we are measured without them too."""
 
 import importlib
 import sys
 from typing import Any
 
-from benchmarks.measure import Options
 
+def load(name: str, is_wanted: bool = True) -> Any:
+    """The module of a peer, or None if it is not wanted, or is missing or broken.
 
-def load(name: str, options: Options) -> Any:
-    """The adapter of a peer, or None if peers are not asked for.
-
-    A peer that is missing or broken is named on stderr, and left out.
+    A missing or broken one is named on stderr.
 
     Args:
       name: of a module in this package.
-      options: whether peers are asked for.
-
-    Returns:
-      The module, or None.
+      is_wanted: whether to load it.
     """
-    if not options.peers:
+    if not is_wanted:
         return None
     try:
         return importlib.import_module(f"benchmarks.peers.{name}")

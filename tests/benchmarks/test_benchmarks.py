@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from benchmarks import ROWS, __main__, peers
-from benchmarks.measure import Options, Side, compare, compiled, joined, make_row
-from jaxsense.run import devices, version
+from benchmarks.measure import Options, Row, Side, compare, compiled, joined
+from jaxsense.run import devices
 from jaxsense.run.devices import Workers
 
 QUICK = ("physics_batch", "rays", "rays_warp", "jmvae")
@@ -138,7 +138,7 @@ def test_all_rows_as_a_user_measures_them(tmp_path):
 def test_missing_peer_is_named_and_left_out(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rejax", None)
     monkeypatch.delitem(sys.modules, "benchmarks.peers.rejax", raising=False)
-    assert peers.load("rejax", Options(peers=True)) is None
+    assert peers.load("rejax") is None
     message = capsys.readouterr().err
     assert message.count("\n") == 1
     assert "peer rejax is left out" in message
@@ -150,21 +150,21 @@ def test_warp_without_a_cuda_device_is_left_out(monkeypatch, capsys):
     package = types.ModuleType("mujoco.mjx.third_party")
     package.__dict__["mujoco_warp"] = sys.modules["mujoco.mjx.third_party.mujoco_warp"]
     monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party", package)
-    assert peers.load("mujoco_warp", Options(peers=True)) is None
+    assert peers.load("mujoco_warp") is None
     message = capsys.readouterr().err
     assert message == "benchmarks: peer mujoco_warp is left out: needs a CUDA device\n"
 
 
 def test_peers_are_not_loaded_unless_asked_for(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rejax", None)
-    assert peers.load("rejax", Options(peers=False)) is None
+    assert peers.load("rejax", False) is None
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize(
     ("argv", "expected"),
     [
-        (["nonsense"], "name = 'nonsense': must be one of physics"),
+        (["nonsense"], "names = ('nonsense',): must be some of physics"),
         (["--quick", "--json", "no/such/folder/rows.json"], "cannot be written"),
         (["--jsn", "rows.json"], "--jsn"),
     ],
@@ -187,24 +187,17 @@ def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     assert "already exists" in capsys.readouterr().err
 
 
-def test_rows_to_keep_are_of_a_commit(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(version, "commit", lambda: "0123456789-dirty")
-    with pytest.raises(SystemExit):
-        __main__.main(["--json", str(tmp_path / "rows.json")])
-    assert "commit = '0123456789-dirty': must be one without changes" in capsys.readouterr().err
-    assert not (tmp_path / "rows.json").exists()
-
-
 def test_a_ratio_is_how_many_times_faster_we_are():
-    rate = make_row("a", "steps/s", 10.0, theirs=5.0, compile_s=1.0, batch=1)
-    seconds = make_row("a", "s", 10.0, theirs=5.0, compile_s=1.0, batch=1)
+    rate, seconds = (Row("a", unit, 10.0, 1.0, 1, theirs=5.0) for unit in ("steps/s", "s"))
     assert (rate.ratio, seconds.ratio) == (2.0, 0.5)
 
 
 def test_a_stopped_peer_is_told_in_the_json():
-    row = make_row("a", "s", 1.0, theirs=9.0, peer="X", compile_s=1.0, batch=1, is_bound=True)
-    written = row.as_json("0123456789")
-    assert (written["peer"], written["commit"]) == ("X (stopped)", "0123456789")
+    row = Row("a", "s", 1.0, 1.0, 1, peer="X", theirs=9.0, is_bound=True, num_devices=2).as_json()
+    assert set(row) == KEYS
+    assert row["peer"] == "X (stopped)"
+    assert row["command"] == "python -m benchmarks a --peers"
+    assert row["device"] == "2 x cpu"
 
 
 def test_sides_take_turns_and_the_fastest_of_each_counts():
@@ -224,7 +217,7 @@ def test_all_cores_take_part_in_the_first_row():
     code = """
 import jax
 from benchmarks import ROWS, __main__
-from benchmarks.measure import make_row
+from benchmarks.measure import Row
 from jaxsense.run import devices
 
 devices.cores = lambda: 2
@@ -232,7 +225,7 @@ devices.cores = lambda: 2
 def row(options):
     assert jax.default_backend() == "cpu"
     assert devices.threads(2) == 2
-    return make_row("jmvae", "samples/s", 1.0, compile_s=0.0, batch=1)
+    return Row("jmvae", "samples/s", 1.0, 0.0, 1)
 
 ROWS["jmvae"] = row
 __main__.main(["jmvae"])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.maps import untrained_task
+from benchmarks.dqn import untrained_task
 from benchmarks.peers.numpy_mdp import NumpyMdp
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import map_mdp, observation
