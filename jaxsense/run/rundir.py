@@ -243,7 +243,7 @@ def _locked(path: Path, field: str) -> Iterator[None]:
             reason = "is being written by another process; wait for it to end"
             raise ConfigError(field, str(path), reason) from None
         except OSError as error:
-            raise ConfigError(field, str(path), f"cannot be locked: {error.strerror}") from None
+            raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
         yield
 
 
