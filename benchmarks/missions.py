@@ -98,7 +98,7 @@ def _play(
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
-        compile_s = compiler.monitor.stopwatch.timing(1)["stages"]["mission"]["compile_s"]
+        compile_s = compiler.monitor.stopwatch.timing()["stages"]["mission"]["compile_s"]
         return Side(run, run().control_steps, batch, compile_s, workers.number)
 
     with contextlib.ExitStack() as stack:

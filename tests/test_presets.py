@@ -185,7 +185,7 @@ def test_many_preset(tmp_path, summary_of):
     latent, naive = many["mission"]["latent"], many["mission"]["naive_3"]
     assert latent["accuracy"] >= 0.95
     # Three looks of each robot at each PoI tell far less than as many where they are needed; how
-    # many naive exploration needs for the same accuracy, `benchmarks.curves` measures.
+    # many naive exploration needs for the same accuracy, `docs/results.md` tells.
     assert latent["accuracy"] >= naive["accuracy"] + 0.08
     assert latent["observations_per_poi"] <= 20
     assert "time limit" not in latent["ended"]

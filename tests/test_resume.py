@@ -149,7 +149,7 @@ def edit(path, field, value):
     (path / "config.json").write_text(json.dumps(content))
 
 
-@pytest.mark.slow  # compiles everything in a new process; `benchmarks.faults` has more
+@pytest.mark.slow  # compiles everything in a new process; see also `test_faults.py`
 def test_a_full_disk_is_named_and_nothing_is_lost(smoke_run, cache, tmp_path):
     path = tmp_path / "run"
 
