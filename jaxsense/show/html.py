@@ -4,12 +4,26 @@ import base64
 import dataclasses
 import re
 from collections.abc import Mapping
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import jinja2
+from markupsafe import Markup
 
 from jaxsense.config.options import command
 
-_SIZE = re.compile(r'viewBox="0 0 ([1-9]\d*) ([1-9]\d*)"')
+_SVG = "{http://www.w3.org/2000/svg}"
+_TAG = re.compile(
+    "circle|clipPath|defs|ellipse|g|line|path|polyline|rect|style|svg|text|title"
+).fullmatch
+_ATTRIBUTE = re.compile(
+    "class|clip-path|c?x|c?y|d|(fill|stroke)?-?opacity|fill|height|id|points|r|role|rx|ry|"
+    "stroke(-dasharray|-dashoffset|-width)?|style|transform|viewBox|width|[xy][12]"
+).fullmatch
+_VALUE = re.compile(
+    r"(?s:(?!.*url\()(?!.*:)[^<>]*)|url\(#view\)|--film:[\d.]+s \d+|animation:[\w .,()-]*"
+).fullmatch
+_KEY_FRAMES = re.compile(r"@keyframes k[0-9a-f]{10}\{(?:[\d.]+%\{[a-z-]+:[\w.,()-]*\})*\}\n?")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,24 +32,42 @@ class Films:
 
     Attributes:
       names: of their files, without suffixes.
-      document: page of their own, for a frame without rights.
-      tall: height of a half of a film relative to its width.
+      drawings: SVG elements, of a film's own kinds alone.
     """
 
     names: tuple[str, ...]
-    document: str
-    tall: float
+    drawings: tuple[Markup, ...]
 
 
 def films(contents: Mapping[str, str]) -> Films:
     """Films for a page.
 
     Args:
-      contents: of their files, by the names of these without suffixes.
+      contents: of their files, by the names of these without suffixes. What no film draws is left
+        out: a file may come from anywhere.
     """
-    sizes = [_SIZE.search(content) for content in contents.values()]
-    tall = max((int(size[2]) / (int(size[1]) / 2) for size in sizes if size), default=1.0)
-    return Films(tuple(contents), render("films.html.jinja", films=contents), tall)
+    return Films(tuple(contents), tuple(map(_drawing, contents.values())))
+
+
+def _drawing(content: str) -> Markup:
+    """The elements, attributes and key frames of a film; nothing if the file is no SVG."""
+    try:
+        root = ElementTree.fromstring(content)
+        copy = _copied(root)
+    except (ElementTree.ParseError, RecursionError):
+        return Markup()
+    is_svg = root.tag == f"{_SVG}svg"
+    return Markup(ElementTree.tostring(copy, encoding="unicode")) if is_svg else Markup()
+
+
+def _copied(element: Element) -> Element:
+    """A copy of what films are made of, without the namespace, which HTML knows."""
+    kept = {name: x for name, x in element.attrib.items() if _ATTRIBUTE(name) and _VALUE(x)}
+    copy = Element(element.tag.removeprefix(_SVG), kept)
+    is_sheet = copy.tag == "style"
+    copy.text = "".join(_KEY_FRAMES.findall(element.text or "")) if is_sheet else element.text
+    copy.extend(_copied(child) for child in element if _TAG(child.tag.removeprefix(_SVG)))
+    return copy
 
 
 def render(template: str, **values: object) -> str:

@@ -1,6 +1,7 @@
 """The whole picture: both views, the activity of each robot, and the time."""
 
 from collections.abc import Mapping
+from importlib import resources
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
@@ -29,24 +30,7 @@ _NOTES = (
     "Identified PoIs are listed at their class.",
     "Dotted circle: PoIs that no robot has seen.",
 )
-_STYLE = """
-.film{--paper:#fff;--ink:#1d2129;--soft:#59616e;--floor:#f2f4f7;color-scheme:light dark}
-.film text{font-family:system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-.film-paper{fill:var(--paper)}.film-floor{fill:var(--floor);stroke:#9aa2ad}
-.film-title{fill:var(--ink);font-size:18px;font-weight:600}
-.film-line{fill:var(--ink);font-size:17px}.film-end{text-anchor:end}
-.film-number{font-size:15px;font-weight:700;text-anchor:middle}
-.film-label{font-size:14px;font-weight:600;text-anchor:middle}
-.film-label.film-on-light{stroke-width:5px}
-.film-note{fill:var(--soft);font-size:14px}
-.film-unknown{fill:#59616e;font-size:12px;text-anchor:middle}.film-start{text-anchor:start}
-.film-on-light{stroke:var(--floor);stroke-width:3px;paint-order:stroke;stroke-linejoin:round}
-.film-on-floor{stroke:var(--floor);stroke-width:9px;paint-order:stroke;stroke-linejoin:round}
-@media (prefers-color-scheme:dark){
-.film{--paper:#16181d;--ink:#e6e8ec;--soft:#a3abb8;--floor:#dfe2e8}}
-.film:active *{animation-play-state:paused!important}
-@media (prefers-reduced-motion:reduce){.film *{animation:none!important}}
-"""
+_STYLE = "\n" + (resources.files("jaxsense.show") / "film.css").read_text(encoding="utf-8")
 
 
 def draw(
