@@ -302,11 +302,11 @@ def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
 
 def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run, evaluated):
     path, _, _ = evaluated
-    # Plots of policies come from each set of arenas; the two films of a training share a frame.
-    for report, episodes, frames, policies in ((smoke_run, 4, 1, 1), (path, 1, 2, 2)):
+    # Plots of policies come from each set of arenas; the two films of a training play together.
+    for report, episodes, groups, policies in ((smoke_run, 4, 1, 1), (path, 1, 2, 2)):
         text = (report / "report.html").read_text()
         assert text.count("image/svg+xml") == 4 + policies
-        assert text.count("<iframe sandbox") == frames
+        assert text.count('<div class="halves') == groups
         assert f"{episodes} missions of each policy" in text
 
 

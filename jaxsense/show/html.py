@@ -66,7 +66,7 @@ def _copied(element: Element) -> Element:
     copy = Element(element.tag.removeprefix(_SVG), kept)
     is_sheet = copy.tag == "style"
     copy.text = "".join(_KEY_FRAMES.findall(element.text or "")) if is_sheet else element.text
-    copy.extend(_copied(child) for child in element if _TAG(child.tag.removeprefix(_SVG)))
+    copy.extend([_copied(child) for child in element if _TAG(child.tag.removeprefix(_SVG))])
     return copy
 
 
