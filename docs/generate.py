@@ -316,7 +316,7 @@ version as long as the major version is 0, and after that only with a new major 
 - the names on this page, the arguments of the functions and the fields of the classes behind
   them;
 - `jaxsense.train.main`, `jaxsense.evaluate.main`, and `main` and `load` of `jaxsense.export`;
-- `read` and `RecordedLooks` of `jaxsense.run.recordings`;
+- `read` and `RecordedLooks` of `jaxsense.recorded`;
 - `reset` and `run_episode` of `jaxsense.dqn.episodes`, and `best` and `Trained` of
   `jaxsense.dqn.policies`;
 - [settings](settings.md), [commands](../getting-started.md#first-steps) and their options;

@@ -25,9 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsense
-from jaxsense import sim
-from jaxsense.run import recordings
-from jaxsense.run.recordings import RecordedLooks
+from jaxsense import recorded, sim
+from jaxsense.recorded import RecordedLooks
 
 
 def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks) -> None:
@@ -122,7 +121,7 @@ def main(argv: list[str] | None = None) -> None:
             with arguments.recording.open("xb") as file:
                 np.savez(file, **found)
             return
-        read(config, models, recordings.read(config, arguments.recording))
+        read(config, models, recorded.read(config, arguments.recording))
     except (OSError, ValueError) as error:
         sys.exit(f"recorded_scans: {error}")
 

@@ -3,13 +3,13 @@
     jaxsense export pretrained:noisy --out robot.zip
     python3 ros2_node.py robot.zip --robot 1 --pois 1.0,0.5 -1.2,0.8 0.3,-1.1
 
-Copy this file, `run_exported.py`, the archive, and `interfaces/robot.py` and `sim/resampling.py` of
-jaxsense to the robot. `--robot` says which robot of the run it is, `--pois` where the points of
-interest (PoIs) stand in the frame `map`. The node reads `scan` (sensor_msgs/LaserScan), or `image`
-and `camera_info` (sensor_msgs/Image, rectified), and the transforms between `map`, `base_link` and
-the sensor. It publishes from where to look as `goal_pose` (geometry_msgs/PoseStamped), to which
-Nav2 drives, exchanges looks with the other robots on `team`, and says on `classes` what each PoI
-probably is (both std_msgs/String, JSON).
+Copy this file, `run_exported.py`, the archive, and `interfaces/robot.py` and
+`recorded/resampling.py` of jaxsense to the robot. `--robot` says which robot of the run it is,
+`--pois` where the points of interest (PoIs) stand in the frame `map`. The node reads `scan`
+(sensor_msgs/LaserScan), or `image` and `camera_info` (sensor_msgs/Image, rectified), and the
+transforms between `map`, `base_link` and the sensor. It publishes from where to look as `goal_pose`
+(geometry_msgs/PoseStamped), to which Nav2 drives, exchanges looks with the other robots on `team`,
+and says on `classes` what each PoI probably is (both std_msgs/String, JSON).
 
 The functions and the class `Robot` do the work; they read messages by their fields alone, so that
 they run and are tested where there is no ROS. `main` connects them to topics.

@@ -1,6 +1,7 @@
 from . import dqn as dqn
 from . import interfaces as interfaces
 from . import mission as mission
+from . import recorded as recorded
 from . import sim as sim
 from . import tasks as tasks
 from . import vae as vae
@@ -24,11 +25,11 @@ from .models import init as init
 from .models import make_bayes as make_bayes
 from .models import make_in_place as make_in_place
 from .models import make_jmvae as make_jmvae
+from .recorded.comparing import compare_scans as compare_scans
 from .run.rundir import load as load
 from .run.score import MissionScore as MissionScore
 from .run.score import score_missions as score_missions
 from .run.version import __version__ as __version__
-from .show.scans import compare_scans as compare_scans
 from .tasks import load_pretrained as load_pretrained
 from .tasks import make as make
 from .tasks import registered as registered

@@ -2,8 +2,8 @@
 
 The file is a zip archive of data: each function as an ONNX file, and a `contents.json` that
 describes inputs and outputs. A robot runs it with two files of this package, which need neither JAX
-nor jaxsense: `interfaces/robot.py` plays the functions, and `sim/resampling.py` turns the scans of
-other sensors into those that `detect` reads.
+nor jaxsense: `interfaces/robot.py` plays the functions, and `recorded/resampling.py` turns the
+scans of other sensors into those that `detect` reads.
 """
 
 import dataclasses

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import export, sim
+from jaxsense import export, recorded, sim
 from jaxsense.config import ViewpointConfig
 from jaxsense.interfaces import robot
-from jaxsense.sim import recorded, resampling
+from jaxsense.recorded import resampling
 
 SCENES = 800
 BEHIND, AHEAD = 0.1, 0.5  # degrees

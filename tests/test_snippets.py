@@ -15,7 +15,8 @@ from onnx import numpy_helper
 from smoke import save_models
 
 import jaxsense
-from jaxsense import PRESETS, export, sim, train
+from jaxsense import PRESETS, export, train
+from jaxsense.recorded import comparing
 from jaxsense.run.rundir import RunDirectory, Settings
 
 ROOT = Path(__file__).parent.parent
@@ -114,7 +115,7 @@ def test_a_policy_is_scored_in_missions(capsys):
 @pytest.mark.slow  # simulates the windows of both sensors to compare with
 def test_recorded_scans_are_compared(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sim.similar, "NUM_SIMULATED", 24)
+    monkeypatch.setattr(comparing, "NUM_SIMULATED", 24)
     np.savez("recorded.npz", **recording)
     config = PRESETS["smoke"]
     with RunDirectory.create(tmp_path / "runs" / "first", Settings("smoke", 0, config)) as created:
@@ -122,7 +123,7 @@ def test_recorded_scans_are_compared(recording, tmp_path, monkeypatch, capsys):
     run(COMPARED)
     printed = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in printed] == ["camera", "lidar"]
-    assert Path("recorded.npz.residuals.svg").exists()
+    assert Path("recorded.npz.svg").exists()
 
 
 def test_an_archive_reads_scans(tmp_path, monkeypatch, capsys):

@@ -185,7 +185,7 @@ _MANY = dataclasses.replace(
     ),
 )
 
-# `sim.recorded.fit_noise` of 704 laser scans, see `docs/robot.md`.
+# `recorded.fit_noise` of 704 laser scans, see `docs/robot.md`.
 _RECORDED = Config(
     lidar=LidarConfig(
         range_noise=0.0048, range_noise_growth=0.0005, mixed_pixels=0.21, dropout=0.00024

@@ -7,9 +7,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     # On import, MJX prints that NVIDIA Warp is not installed; nothing here uses it.
     import mujoco.mjx as _  # noqa: F401
 
-from jaxsense.sim import recorded as recorded
 from jaxsense.sim import sensors as sensors
-from jaxsense.sim import similar as similar
 from jaxsense.sim import windows as windows
 from jaxsense.sim.arena import Arena as Arena
 from jaxsense.sim.arena import Layout as Layout

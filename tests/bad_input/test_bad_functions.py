@@ -11,13 +11,12 @@ from refusals import INF, NAN, SMOKE
 from untrained import untrained
 
 import jaxsense
-from jaxsense import Belief, Transition, dqn, mission, sim, tasks, vae
+from jaxsense import Belief, Transition, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.config import FilterConfig
 from jaxsense.dqn import replay
 from jaxsense.interfaces import common
 from jaxsense.mission import roadmap
 from jaxsense.run import batches
-from jaxsense.sim import recorded
 from jaxsense.vae import filter
 
 # Settings whose models have other shapes.

@@ -15,7 +15,7 @@ from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.core.types import Belief
 from jaxsense.interfaces import robot
 from jaxsense.models import make_in_place
-from jaxsense.sim import resampling
+from jaxsense.recorded import resampling
 from jaxsense.vae.novelty import Novelty
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "run_exported.py"

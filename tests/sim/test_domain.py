@@ -9,7 +9,7 @@ import pytest
 
 import jaxsense
 from jaxsense.config import PRESETS, LocalisationConfig
-from jaxsense.sim import resampling, sensors, windows
+from jaxsense.sim import sensors, windows
 from jaxsense.sim.domain import make_domain
 
 CONFIG = PRESETS["smoke"]
@@ -167,60 +167,3 @@ def test_a_bearing_of_a_turn_more_is_the_same_look(m):
     beyond = MODELS.detect(m, sensor, scan, jnp.float32(0.2), jnp.float32(1.3))
     assert not bool(beyond.is_known | beyond.is_there)
     np.testing.assert_array_equal(beyond.features, 0.5)
-
-
-def wall(angles):
-    """A wall 2 m ahead, as seen along rays."""
-    return 2 / np.cos(angles)
-
-
-def merged(angles, between):
-    """Three sweeps a little apart."""
-    return np.concatenate([angles + i * between for i in range(3)])
-
-
-AHEAD = np.radians(np.arange(-30, 31))
-UNEVEN = np.radians(np.concatenate([np.arange(-30, 0, 0.1), np.arange(0, 31, 0.5)]))
-
-
-@pytest.mark.parametrize(
-    "angles",
-    [
-        AHEAD,
-        merged(AHEAD, 1e-7),
-        merged(AHEAD, 1e-3),
-        UNEVEN,
-        np.radians(np.arange(-30, 31, 0.1)),
-        np.radians(np.arange(-30, 31, 3.0)),
-    ],
-    ids=["even", "merged", "interlaced", "uneven", "fine", "coarse"],
-)
-def test_scans_along_any_rays_are_read_where_they_were_recorded(angles):
-    rng = np.random.default_rng(0)
-    order = rng.permutation(len(angles))
-    targets = np.radians(np.arange(-29, 30))
-    found = resampling.resample(targets, angles[order], wall(angles)[order], measures_distance=True)
-    # Between rays .0524 rad apart, a straight line is off by at most r'' / 8 of the squared angle:
-    # at 30 degrees 2 (1 + 2 tan^2) / cos / 8 * .0524^2 = .0013 m.
-    np.testing.assert_allclose(found, wall(targets), atol=0.0014)
-    # A lost beam of one sweep, or of an uneven scan, is closed.
-    lost = wall(angles)
-    lost[len(angles) // 2] = np.inf
-    step = resampling.median_step(targets)
-    closed = resampling.close_gaps(angles[order], lost[order], step=step)
-    np.testing.assert_allclose(closed, wall(angles)[order], atol=0.08)
-
-
-def test_a_gap_wider_than_three_steps_of_the_rays_that_are_read_was_not_recorded():
-    targets = np.radians(np.arange(-10.0, 11.0))
-    # Merged sweeps of every 3 degrees were recorded, of every 4 degrees only near their rays.
-    for between, share in ((3.0, 1.0), (4.0, 5 / 21)):
-        angles = merged(np.radians(np.arange(-12.0, 13.0, between)), 1e-7)
-        found = resampling.resample(targets, angles, wall(angles), measures_distance=True)
-        assert np.isfinite(found).mean() == pytest.approx(share)
-        np.testing.assert_array_equal(np.isfinite(found), resampling.covered(targets, angles))
-    # As far apart as is needed.
-    assert resampling.covered(targets, angles, step=np.radians(2.0)).all()
-    # One ray has no step: that of the recorded ones counts.
-    assert resampling.covered(np.zeros(1), np.radians([-5.0, 5.0, 15.0])).all()
-    assert not resampling.covered(np.zeros(1), np.radians([100.0, 101.0, 102.0])).any()

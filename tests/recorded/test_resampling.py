@@ -1,27 +1,19 @@
-"""Recorded scans: other rays, and the noise of a LiDAR."""
+"""Recorded scans along other rays."""
 
-from dataclasses import replace
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsense import recorded
 from jaxsense.config import CameraConfig, LidarConfig
-from jaxsense.sim import disturbances, raycast, recorded, resampling, sensors
+from jaxsense.recorded import resampling
+from jaxsense.sim import sensors
 
 LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
 CAMERA = sensors.camera(CameraConfig(num_pixels=8, window=3, stride=1))
-ANGLES = np.radians(np.linspace(-90, 90, 361)).astype(np.float32)
 
 
 def degrees(*values):
     return np.radians(np.array(values, float))
-
-
-def test_the_rays_of_a_sensor_read_what_was_recorded_along_them():
-    readings = 1 + np.arange(18.0).reshape(2, 9)
-    np.testing.assert_allclose(recorded.resample(LIDAR, LIDAR.angles, readings), readings)
 
 
 @pytest.mark.parametrize(
@@ -115,13 +107,6 @@ def test_a_gap_in_the_recording_was_not_recorded():
     np.testing.assert_array_equal(np.isnan(found), is_gap)
 
 
-def test_the_widest_part_that_was_recorded_counts():
-    sensor = sensors.lidar(LidarConfig(num_beams=81, field_of_view=80.0, window=60))
-    angles = degrees(*range(-40, -29), *range(-10, 31))
-    with pytest.raises(ValueError, match=r"= 40\.0 degrees: must be at least 59\.0"):
-        recorded.resample(sensor, angles, np.ones((1, len(angles))))
-
-
 @pytest.mark.parametrize(
     ("angles", "reason"),
     [
@@ -130,11 +115,8 @@ def test_the_widest_part_that_was_recorded_counts():
             r"step between the rays of lidar = 40.00 degrees: must be at most 30",
         ),
         (degrees(0), r"step between the rays of lidar = inf degrees"),
-        (degrees(0, 5, 10), r"field of view of lidar = 10.0 degrees: must be at least 20.0, as"),
-        (
-            degrees(*range(150, 211, 10)),
-            r"recorded part of the field of view of lidar = 0.0 degrees: must",
-        ),
+        (degrees(0, 5, 10), r"2 rays of lidar were recorded: must be at least 3, as wide as the"),
+        (degrees(*range(150, 211, 10)), "0 rays of lidar were recorded: must"),
         (degrees(0, np.nan, 10), "angles of lidar = nan: must be from -2 pi to 2 pi"),
     ],
 )
@@ -150,100 +132,61 @@ def test_each_ray_of_a_scan_has_an_angle():
         recorded.resample(LIDAR, LIDAR.angles, np.ones((1, 4)))
 
 
-def rooms(noise, number=1500):
-    """Scans of rooms with a pillar, by a scanner with known noise."""
-    angles = jnp.asarray(ANGLES)
-
-    @jax.jit
-    @jax.vmap
-    def scan(key):
-        place_key, noise_key = jax.random.split(key)
-        x, y, turn, size = jax.random.uniform(place_key, (4,))
-        centre = jnp.stack([jnp.array([1.2, y - 0.5]), jnp.array([x - 0.5, y - 0.5])])
-        axis = jnp.stack([jnp.array([1.0, 0.0]), jnp.stack([jnp.cos(turn), jnp.sin(turn)])])
-        half = jnp.stack([jnp.full(2, 0.3), jnp.stack([3.0 + size, 3.0 + x])])
-        section = raycast.CrossSection(centre, axis, half, (0, 1), 0)
-        distance = raycast.cast(section, jnp.zeros(2), angles).distance
-        return disturbances.measured_ranges(noise_key, distance, noise)
-
-    ranges = np.asarray(scan(jax.random.split(jax.random.key(0), number)))
-    return np.where(ranges >= noise.max_range, np.inf, ranges)
+def wall(angles):
+    """A wall 2 m ahead, as seen along rays."""
+    return 2 / np.cos(angles)
 
 
-@pytest.fixture(scope="module")
-def measured():
-    noise = LidarConfig(range_noise=0.006, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01)
-    return noise, rooms(noise)
+def merged(angles, between):
+    """Three sweeps a little apart."""
+    return np.concatenate([angles + i * between for i in range(3)])
 
 
-def test_noise_is_fitted_to_scans(measured):
-    noise, ranges = measured
-    found = recorded.fit_noise(LidarConfig(), ANGLES, ranges)
-    assert found.range_noise == pytest.approx(noise.range_noise, abs=0.0005)
-    assert found.range_noise_growth == pytest.approx(noise.range_noise_growth, abs=0.0002)
-    assert 0.1 < found.mixed_pixels < 0.145  # an upper bound, see docs/robot.md
-    assert found.dropout == pytest.approx(noise.dropout, abs=0.001)
-    assert replace(noise, range_noise=0.01) == replace(
-        found, range_noise=0.01, range_noise_growth=0.001, mixed_pixels=0.1, dropout=0.01
-    )
-    # Some drivers write 0 for no return.
-    assert recorded.fit_noise(LidarConfig(), ANGLES, np.where(np.isinf(ranges), 0, ranges)) == found
+AHEAD = np.radians(np.arange(-30, 31))
+UNEVEN = np.radians(np.concatenate([np.arange(-30, 0, 0.1), np.arange(0, 31, 0.5)]))
 
 
-def test_beams_without_a_return_are_no_wall():
-    wall = 2 / np.cos(ANGLES[90:271])
-    wall[30:60] = np.inf
-    expected = recorded.wall_residuals(ANGLES[90:271], wall[None])
-    assert len(expected[0]) == 10  # of 12 pieces
-    with_zeros = np.where(np.isinf(wall), 0, wall)
-    found = recorded.wall_residuals(ANGLES[90:271], with_zeros[None])
-    for ours, theirs in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-
-
-def test_a_scan_narrower_than_a_piece_of_wall_is_refused():
-    with pytest.raises(ValueError, match="number of angles = 14: must be at least 15"):
-        recorded.wall_residuals(ANGLES[:14], np.ones((1, 14)))
-
-
-def test_noise_is_fitted_without_bias():
-    # Two walls, 2 and 3 m ahead, and one edge between them, at which 30 % of the beams are mixed.
+@pytest.mark.parametrize(
+    "angles",
+    [
+        AHEAD,
+        merged(AHEAD, 1e-7),
+        merged(AHEAD, 1e-3),
+        UNEVEN,
+        np.radians(np.arange(-30, 31, 0.1)),
+        np.radians(np.arange(-30, 31, 3.0)),
+    ],
+    ids=["even", "merged", "interlaced", "uneven", "fine", "coarse"],
+)
+def test_scans_along_any_rays_are_read_where_they_were_recorded(angles):
     rng = np.random.default_rng(0)
-    angles = ANGLES[90:271]
-    depth = np.where(np.arange(181) < 90, 2.0, 3.0) / np.cos(angles)
-    ranges = np.repeat(depth[None], 6000, axis=0)
-    is_mixed = rng.uniform(size=6000) < 0.3
-    ranges[is_mixed, 90] = rng.uniform(2.0, 3.0, is_mixed.sum())
-    ranges += 0.01 * rng.normal(size=ranges.shape)
-    found = recorded.fit_noise(LidarConfig(), angles, ranges)
-    at_wall = found.range_noise + 2.5 * found.range_noise_growth
-    assert at_wall == pytest.approx(0.01, rel=0.01)
-    assert found.mixed_pixels == pytest.approx(0.3, abs=0.025)
-    assert found.dropout == 0.0
+    order = rng.permutation(len(angles))
+    targets = np.radians(np.arange(-29, 30))
+    found = resampling.resample(targets, angles[order], wall(angles)[order], measures_distance=True)
+    # Between rays .0524 rad apart, a straight line is off by at most r'' / 8 of the squared angle:
+    # at 30 degrees 2 (1 + 2 tan^2) / cos / 8 * .0524^2 = .0013 m.
+    np.testing.assert_allclose(found, wall(targets), atol=0.0014)
+    # A lost beam of one sweep, or of an uneven scan, is closed.
+    lost = wall(angles)
+    lost[len(angles) // 2] = np.inf
+    step = resampling.median_step(targets)
+    closed = resampling.close_gaps(angles[order], lost[order], step=step)
+    np.testing.assert_allclose(closed, wall(angles)[order], atol=0.08)
 
 
-def test_residuals_are_those_of_straight_walls():
-    # The wall x = 2 m, of which residuals are as small as float32 allows, and what is no wall.
-    wall = 2 / np.cos(ANGLES[90:271])
-    residuals, distances = recorded.wall_residuals(ANGLES[90:271], wall[None])
-    assert residuals.shape == (12, 15)  # 181 beams
-    np.testing.assert_allclose(residuals, 0.0, atol=1e-5)
-    np.testing.assert_allclose(distances[0], wall[:15].mean(), rtol=1e-6)
-    edge = np.where(np.arange(15) < 7, wall[:15], wall[:15] + 1)
-    for other in (edge, np.full(15, np.inf), 1 / np.cos(np.linspace(1.2, 1.4, 15))):
-        with np.errstate(all="ignore"):
-            found, _ = recorded.wall_residuals(ANGLES[90:105], other[None])
-        assert len(found) == 0
-
-
-def test_too_few_scans_to_fit_the_noise_to_are_named():
-    expected = "scans show 0 pieces of walls, 20 or more of them in 0 bins of half a metre: must be"
-    with pytest.raises(ValueError, match=expected):
-        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), np.inf, np.float32))
-    # A round room has all of its walls at one distance.
-    expected = "pieces of walls, 20 or more of them in 1 bins"
-    with pytest.raises(ValueError, match=expected):
-        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), 2.2, np.float32))
+def test_a_gap_wider_than_three_steps_of_the_rays_that_are_read_was_not_recorded():
+    targets = np.radians(np.arange(-10.0, 11.0))
+    # Merged sweeps of every 3 degrees were recorded, of every 4 degrees only near their rays.
+    for between, share in ((3.0, 1.0), (4.0, 5 / 21)):
+        angles = merged(np.radians(np.arange(-12.0, 13.0, between)), 1e-7)
+        found = resampling.resample(targets, angles, wall(angles), measures_distance=True)
+        assert np.isfinite(found).mean() == pytest.approx(share)
+        np.testing.assert_array_equal(np.isfinite(found), resampling.covered(targets, angles))
+    # As far apart as is needed.
+    assert resampling.covered(targets, angles, step=np.radians(2.0)).all()
+    # One ray has no step: that of the recorded ones counts.
+    assert resampling.covered(np.zeros(1), np.radians([-5.0, 5.0, 15.0])).all()
+    assert not resampling.covered(np.zeros(1), np.radians([100.0, 101.0, 102.0])).any()
 
 
 def test_short_gaps_between_beams_are_closed():

@@ -8,8 +8,7 @@ import numpy as np
 _TURN = 2 * np.pi + 1e-3  # rad; drivers round the last angle
 _ROUNDING = 1e-6  # rad
 MAX_STEPS = 3.0
-"""A gap between two recorded rays of more than this many steps of the rays that are read was not
-recorded."""
+"""Widest gap between two recorded rays, in steps of the rays that are read."""
 MAX_LOST = 5
 """Beams in a row that may have been lost; where more have no return, nothing is near."""
 SURFACE = 0.1
@@ -24,23 +23,19 @@ def resample(
     measures_distance: bool,
     step: float | None = None,
 ) -> np.ndarray:
-    """Readings along other rays.
+    """Readings along other rays, NaN where nothing was recorded, see `covered`.
 
-    Between two recorded rays, readings are interpolated; distances only on one surface, otherwise
+    Readings are interpolated between two recorded rays, distances only on one surface; elsewhere
     the nearest ray counts. A distance of 0 is no return and becomes infinite. The last ray of a
-    full circle has the first as its neighbour. Recorded rays need not be evenly spaced, as those
-    of several sweeps are not.
+    full circle has the first as its neighbour. Recorded rays may come in any order, unevenly
+    spaced, as those of several sweeps.
 
     Args:
       targets: `[B]` directions of the rays to read along, in radians.
-      angles: `[A]` directions of the recorded rays in the same frame, in radians, in any order; two
-        or more.
-      readings: `[A, ...]` recorded distances in metres, or other readings of these rays.
+      angles: `[A]` directions of the recorded rays in the same frame, in radians; two or more.
+      readings: `[A, ...]` recorded distances in metres, or other readings.
       measures_distance: whether readings are distances.
       step: see `covered`.
-
-    Returns:
-      `[B, ...]` readings along `targets`, NaN where nothing was recorded, see `covered`.
 
     Raises:
       ValueError: if angles are not finite or beyond a turn, or readings are not one for each.
@@ -67,7 +62,7 @@ def resample(
 
 
 def with_returns(ranges: np.ndarray) -> np.ndarray:
-    """Distances in metres, float32, infinite instead of 0 where a beam has no return."""
+    """Distances as float32, infinite instead of 0 where a beam has no return."""
     ranges = np.asarray(ranges, np.float32)
     return np.where(ranges == 0, np.float32(np.inf), ranges)
 
@@ -75,22 +70,18 @@ def with_returns(ranges: np.ndarray) -> np.ndarray:
 def close_gaps(
     angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST, step: float | None = None
 ) -> np.ndarray:
-    """Distances in which beams that were lost take those of their neighbours.
+    """Distances with gaps of lost beams filled by the nearest neighbour.
 
-    Where up to `most` beams in a row have no return and those on both sides have one, each takes
-    the distance of the nearest that has. Longer gaps stay, as do gaps next to something too near
-    (minus infinity) or to directions that were not recorded. The last beam of a full circle has the
-    first as its neighbour.
+    A gap is up to `most` beams in a row without a return, between two that have one. Gaps next to
+    something too near (minus infinity) or to directions that were not recorded stay. The last beam
+    of a full circle has the first as its neighbour.
 
     Args:
       angles: `[A]` directions of the beams, in radians, in any order.
       ranges: `[A]` distances in metres; 0, infinite or NaN without a return.
       most: beams in a gap.
-      step: angle between the rays that are read later, in radians: what was not recorded is wider
-        than `MAX_STEPS` of them. By default the median one between beams, for evenly spaced ones.
-
-    Returns:
-      `[A]` float32.
+      step: angle between the rays that are read later, in radians; beams farther apart than
+        `MAX_STEPS` of it are no neighbours. By default the median one between beams.
 
     Raises:
       ValueError: if angles are not finite or beyond a turn, or distances are not one for each.
@@ -107,7 +98,7 @@ def close_gaps(
     along = turned[beams] + np.repeat([-2 * np.pi, 0.0, 2 * np.pi], len(order))
     # What was not recorded separates beams.
     step = median_step(angles) if step is None else step
-    part = np.cumsum(np.diff(along, prepend=along[:1]) > _widest(step))
+    part = np.cumsum(np.diff(along, prepend=along[:1]) > MAX_STEPS * step + _ROUNDING)
     is_lost = (np.isnan(ranges) | (ranges == np.inf))[beams]
     known, here = np.flatnonzero(~is_lost), np.arange(len(beams))
     if not len(known):
@@ -125,15 +116,7 @@ def close_gaps(
 
 
 def require_angles(name: str, angles: np.ndarray) -> None:
-    """Checks directions of rays.
-
-    Args:
-      name: of the array.
-      angles: the directions, in radians.
-
-    Raises:
-      ValueError: if one is not finite, or beyond a turn to either side.
-    """
+    """Raises `ValueError` if an angle, in radians, is not finite or beyond a turn."""
     wrong = np.asarray(angles)[~(np.abs(angles) <= _TURN)]
     if wrong.size:
         expected = "must be from -2 pi to 2 pi (in radians?)"
@@ -143,32 +126,22 @@ def require_angles(name: str, angles: np.ndarray) -> None:
 def covered(targets: np.ndarray, angles: np.ndarray, step: float | None = None) -> np.ndarray:
     """Which of some rays lie in the recorded field of view.
 
+    These lie between two recorded rays at most `MAX_STEPS` steps apart, or within half a step of
+    one.
+
     Args:
       targets: `[B]` directions of these rays, in radians.
       angles: `[A]` directions of the recorded rays, in radians, in any order; two or more.
       step: angle between the rays that are read, in radians; by default the median one of
         `targets`.
-
-    Returns:
-      `[B]` bool: between two recorded rays no farther apart than `MAX_STEPS` steps, or within half
-      a step of one.
     """
     return _neighbours(targets, angles, step)[-1]
 
 
 def median_step(angles: np.ndarray) -> float:
-    """Median angle between neighbouring rays, in radians; infinite if there is only one.
-
-    Args:
-      angles: directions of the rays, in radians, in any order.
-    """
+    """Median angle between neighbouring rays, in radians; infinite if there is only one."""
     steps = np.diff(np.unique(within_a_turn(angles)))
     return float(np.median(steps)) if len(steps) else np.inf
-
-
-def _widest(step: float) -> float:
-    """Widest gap between recorded rays that is none, in radians."""
-    return MAX_STEPS * step + _ROUNDING
 
 
 def within_a_turn(angles: np.ndarray) -> np.ndarray:
@@ -176,13 +149,11 @@ def within_a_turn(angles: np.ndarray) -> np.ndarray:
     return (np.asarray(angles, np.float64) + np.pi) % (2 * np.pi) - np.pi
 
 
-def _neighbours(
-    targets: np.ndarray, angles: np.ndarray, step: float | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Recorded rays to the right and to the left of each target.
+def _neighbours(targets: np.ndarray, angles: np.ndarray, step: float | None) -> tuple:
+    """Recorded rays around each target.
 
-    Returns their indices; how far the target is from one to the other, from 0 to 1; whether what
-    lies between them was recorded; and whether the target was, see `covered`.
+    Returns their indices, to the right and to the left; how far the target is from one to the
+    other, from 0 to 1; whether what lies between them was recorded; and whether the target was.
     """
     if step is None:
         step = median_step(targets if np.size(targets) > 1 else angles)
@@ -194,6 +165,6 @@ def _neighbours(
     right = np.searchsorted(circle, targets, side="right") - 1
     gap = circle[right + 1] - circle[right]
     share = (targets - circle[right]) / gap
-    is_between = gap <= _widest(step)
+    is_between = gap <= MAX_STEPS * step + _ROUNDING
     is_covered = is_between | (np.minimum(share, 1 - share) * gap < step / 2)
     return order[right], order[right + 1], share, is_between, is_covered

@@ -1,4 +1,4 @@
-"""Recordings: looks of real sensors in one file, checked against the sensors of a run."""
+"""Looks of real sensors, read from one file and checked against the sensors of a run."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsense.config import Config
-from jaxsense.sim import recorded, resampling, sensors
+from jaxsense.recorded import resampling
+from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 
 
@@ -18,9 +19,9 @@ class RecordedLooks:
     """Looks at C PoIs by some or all sensors of a run.
 
     Attributes:
-      positions: `[C, 2]` of the PoIs, in metres.
-      poses: for each sensor `[C, 3]` from where it looked: x [m], y [m] and yaw [rad].
-      scans: for each sensor `[C, B, ...]` readings of its rays, NaN where none was recorded.
+      positions: of the PoIs, in metres.
+      poses: for each sensor from where it looked: x [m], y [m] and yaw [rad].
+      scans: for each sensor readings of its rays, NaN where none was recorded.
     """
 
     positions: Float[np.ndarray, "C 2"]
@@ -28,11 +29,7 @@ class RecordedLooks:
     scans: Mapping[str, Float[np.ndarray, "C B *channels"]]
 
     def seen_from(self, name: str) -> tuple[Float[np.ndarray, " C"], Float[np.ndarray, " C"]]:
-        """Bearing, in radians, and distance, in metres, of each PoI from a sensor.
-
-        Args:
-          name: of the sensor.
-        """
+        """Bearing, in radians, and distance, in metres, of each PoI from the sensor `name`."""
         x, y = (self.positions - self.poses[name][:, :2]).T
         bearing = resampling.within_a_turn(np.arctan2(y, x) - self.poses[name][:, 2])
         return bearing.astype(np.float32), np.hypot(x, y).astype(np.float32)
@@ -50,12 +47,7 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
 
     A distance is infinite or 0 for a ray without a return, and any reading NaN for a ray that was
     not recorded. Short gaps between rays with a return are closed, see `resampling.close_gaps`. A
-    sensor may be missing, but not all. Scans along other rays are resampled, see
-    `sim.recorded.resample`.
-
-    Args:
-      config: settings of the run.
-      file: the recording.
+    sensor may be missing, but not all. Scans along other rays are resampled, see `resample`.
 
     Raises:
       OSError: if the file cannot be read.
@@ -71,17 +63,15 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
         expected = "is not a whole file of NumPy's format .npz, or holds objects, not numbers"
         raise ValueError(f"{file} {expected}") from None
     made = sensors.make(config)
-    parts = [f"{sensor.name}_{part}" for sensor in made for part in ("poses", "scans")]
-    known = {"places", *parts, *(f"{sensor.name}_angles" for sensor in made)}
+    known = {"places"} | {f"{s.name}_{part}" for s in made for part in ("poses", "scans", "angles")}
     for name in found:
         if name not in known and name.endswith(("_poses", "_scans", "_angles")):
             expected = f"must be {' or '.join(sensor.name for sensor in made)}"
             raise ValueError(f"{name} is of an unknown sensor; {expected}")
     some = [s for s in made if {f"{s.name}_poses", f"{s.name}_scans"} & {*found}] or made
-    needed = [f"{sensor.name}_{part}" for sensor in some for part in ("poses", "scans")]
-    for name in ("places", *needed):
+    for name in ("places", *(f"{s.name}_{part}" for s in some for part in ("poses", "scans"))):
         if name not in found:
-            raise ValueError(f"{name} is missing; a recording holds places, {', '.join(parts)}")
+            raise ValueError(f"{name} is missing; a recording holds {', '.join(sorted(known))}")
     _require_shape(found, "places", ("C", 2))
     scans = {sensor.name: _scans(found, sensor) for sensor in some}
     poses = {sensor.name: found[f"{sensor.name}_poses"] for sensor in some}
@@ -89,10 +79,10 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
 
 
 def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
-    """Checks the looks of one sensor; returns its scans along the sensor's rays."""
+    """Checked scans of one sensor, along its own rays and without the gaps of lost beams."""
     _require_shape(found, f"{sensor.name}_poses", ("C", 3))
     name, angles = f"{sensor.name}_scans", f"{sensor.name}_angles"
-    if name in found and sensor.channels == 3 and found[name].dtype.kind in "iu":
+    if sensor.channels == 3 and found[name].dtype.kind in "iu":
         expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
         raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
     rays, others = sensor.angles, f"; of other rays, {angles} must hold the angles, in radians"
@@ -101,29 +91,16 @@ def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
         rays, others = found[angles], ""
         resampling.require_angles(f"angles of {sensor.name}", rays)
     _require_shape(found, name, ("C", len(rays), *sensor.shape[1:]), others)
-    _require_valid(found[name], sensor)
-    scans = _closed(sensor, rays, found[name])
-    return recorded.resample(sensor, rays, scans) if angles in found else scans
-
-
-def _closed(sensor: Sensor, angles: np.ndarray, scans: np.ndarray) -> np.ndarray:
-    """Scans without the gaps of lost beams, as robots read them."""
-    if not sensor.measures_distance:
-        return scans
-    closed = [resampling.close_gaps(angles, scan, step=sensor.steps[1]) for scan in scans]
-    found = np.array(closed, np.float32).reshape(scans.shape)
-    return np.where(np.isnan(scans), np.float32(np.nan), found)
-
-
-def _require_valid(scans: np.ndarray, sensor: Sensor) -> None:
-    """Raises `ValueError` if a reading is negative, or a brightness above 1."""
-    is_valid = np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32)))
-    is_wrong = ~is_valid & ~np.isnan(scans)
-    if is_wrong.any():
+    scans = found[name]
+    is_valid = np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32))) | np.isnan(scans)
+    if not is_valid.all():
         returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
         most = " and at most 1, linear RGB" if sensor.channels == 3 else ""
-        found = f"{sensor.name}_scans holds {scans[is_wrong][0]:g}"
-        raise ValueError(f"{found}; must be at least 0{returns or most}")
+        raise ValueError(f"{name} holds {scans[~is_valid][0]:g}; must be at least 0{returns}{most}")
+    if sensor.measures_distance:
+        closed = [resampling.close_gaps(rays, scan, step=sensor.steps[1]) for scan in scans]
+        scans = np.where(np.isnan(scans), np.float32(np.nan), np.reshape(closed, scans.shape))
+    return resample(sensor, rays, scans) if angles in found else scans
 
 
 def _require_shape(
@@ -133,11 +110,52 @@ def _require_shape(
     array = found[name]
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} must hold numbers, not {array.dtype}")
-    sizes: dict[int | str, int | None] = {
-        "C": next(iter(found["places"].shape), None),
-        "A": array.size,
-    }
-    if array.shape != tuple(sizes.get(size, size) for size in shape):
+    sizes = {"C": next(iter(found["places"].shape), None), "A": array.size}
+    if array.shape != tuple(sizes.get(str(size), size) for size in shape):
         text = f"({', '.join(map(str, shape))})".replace("(A)", "(A,)")
         of_places = " for C places" if "C" in shape else ""
         raise ValueError(f"{name} has the shape {array.shape}; must be {text}{of_places}{others}")
+
+
+def resample(
+    sensor: Sensor,
+    angles: Float[np.ndarray, " A"],
+    readings: Float[np.ndarray, "S A *channels"],
+) -> Float[np.ndarray, "S B *channels"]:
+    """Resamples recorded scans to the rays of a simulated sensor, see `resampling.resample`.
+
+    Args:
+      sensor: the sensor.
+      angles: directions of the recorded rays in the robot's frame, in radians, in any order.
+      readings: recorded scans, in the units of the sensor.
+
+    Returns:
+      Readings, NaN outside the recorded field of view: `Models.detect` then says that nothing is
+      known.
+
+    Raises:
+      ValueError: if an angle is no direction, or the recorded rays are too few or too far apart.
+    """
+    angles = np.asarray(angles, np.float64)
+    resampling.require_angles(f"angles of {sensor.name}", angles)
+    if readings.shape[1:2] != angles.shape:
+        expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
+        raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
+    step, between = np.degrees(sensor.steps[1]), np.degrees(resampling.median_step(angles))
+    if between > resampling.MAX_STEPS * step:
+        expected = f"must be at most {resampling.MAX_STEPS * step:.2f} degrees"
+        found = f"step between the rays of {sensor.name} = {between:.2f} degrees"
+        raise ValueError(f"{found}: {expected}")
+    needed = (sensor.window - 1) * sensor.stride + 1
+    number = int(resampling.covered(sensor.angles, angles, sensor.steps[1]).sum())
+    if number < needed:
+        expected = f"must be at least {needed}, as wide as the window of its detector"
+        raise ValueError(f"{number} rays of {sensor.name} were recorded: {expected}")
+    found = resampling.resample(
+        sensor.angles,
+        angles,
+        np.moveaxis(readings, 1, 0),
+        measures_distance=sensor.measures_distance,
+        step=sensor.steps[1],
+    )
+    return np.moveaxis(found, 0, 1)

@@ -1,0 +1,6 @@
+"""Recordings of real sensors: reading them, other rays, and the noise of a LiDAR."""
+
+from jaxsense.recorded.noise import fit_noise as fit_noise
+from jaxsense.recorded.reading import RecordedLooks as RecordedLooks
+from jaxsense.recorded.reading import read as read
+from jaxsense.recorded.reading import resample as resample

@@ -1,0 +1,154 @@
+"""Recorded looks next to simulated ones."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import save_models
+
+import jaxsense
+from jaxsense import sim
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.recorded import comparing
+from jaxsense.run.rundir import RunDirectory, Settings
+
+SMOKE = PRESETS["smoke"]
+# Without noise, the error of the bearing alone tells windows apart.
+EXACT = replace(SMOKE, lidar=replace(SMOKE.lidar, range_noise=0.0))
+CONFIG = replace(SMOKE, arena=replace(SMOKE.arena, side=4.0))
+CYLINDER, CUBE = 0, 2
+
+
+@pytest.fixture(scope="module")
+def world():
+    return comparing.make_world(EXACT, 2.0)
+
+
+def test_walls_are_behind_the_poi(world):
+    assert world.arena.config.side >= 4.0
+    assert comparing.make_world(SMOKE, 0.5).arena.config == SMOKE.arena
+    with pytest.raises(ConfigError, match=r"arena\.side"):
+        comparing.make_world(replace(SMOKE, arena=replace(SMOKE.arena, side=101.0)), 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bearing", "distance"), [(0.0, 1.4), (-1.2, 0.5)])
+def test_a_simulated_look_shows_a_lone_poi_where_it_is_expected(world, bearing, distance):
+    look = jax.jit(
+        lambda key: comparing.simulate(
+            key, world, 1, jnp.int32(CYLINDER), jnp.float32(bearing), jnp.float32(distance)
+        )
+    )
+    ranges = np.stack([look(key) for key in jax.random.split(jax.random.key(0), 10)])
+    np.testing.assert_allclose(ranges.min(axis=1), distance - 0.1, atol=2e-3)
+    # As many beams as arcsin(radius / distance) to either side; walls are behind.
+    near = (ranges < distance).sum(axis=1) * np.radians(240 / 682)
+    np.testing.assert_allclose(near, 2 * np.arcsin(0.1 / distance), atol=np.radians(0.8))
+    middle = np.array([np.flatnonzero(x < distance).mean() for x in ranges]) - 63.5
+    assert 0.3 < np.abs(middle).max() * 240 / 682 < 1.4  # degrees
+
+
+@pytest.mark.slow
+def test_a_window_is_as_far_from_simulated_ones_as_it_is_off(world):
+    bearing, distance = jnp.float32(0.2), jnp.float32(0.8)
+
+    @jax.jit
+    def compare(key, off):
+        look_key, nearest_key = jax.random.split(key)
+        window = comparing.simulate(look_key, world, 1, jnp.int32(CUBE), bearing, distance)
+        return comparing.nearest(nearest_key, world, 1, window + off, bearing, distance)
+
+    def compared(off):
+        each = [compare(key, off) for key in jax.random.split(jax.random.key(3), 8)]
+        return [np.stack(x) for x in zip(*each, strict=True)]
+
+    _, residuals, usual = compared(0.0)
+    window, off, same = compared(-0.2)
+    apart = comparing.root_mean_square
+    assert np.median(apart(residuals)) < 0.01
+    assert np.median(apart(usual)) < 0.01
+    # A cube's corner is nearer by .04 m than its side, which makes up for a part.
+    assert 0.14 < np.median(apart(off)) < 0.2
+    np.testing.assert_array_equal(same, usual)
+    # What was recorded is the simulated window and the residuals, nearer and at the PoI alone.
+    is_at_poi = np.isfinite(off)
+    np.testing.assert_array_equal(is_at_poi, np.isfinite(usual))
+    assert -0.21 < np.median(off[is_at_poi]) < -0.14
+    # Both edges of a PoI of any shape, less the error of the bearing to either side.
+    within = np.degrees(np.arcsin(0.1 / 0.8)) - 1
+    np.testing.assert_allclose(is_at_poi.sum(axis=1), 2 * within / (240 / 682), atol=1.5)
+    whole = (window + off)[is_at_poi]
+    assert 0.4 < whole.min() < whole.max() < 0.7
+
+
+def test_root_mean_squares_are_of_the_rays_at_the_poi():
+    residuals = jnp.array([[jnp.nan, 0.3, -0.4, jnp.nan], [0.2, 0.2, 0.2, 0.2]])
+    # sqrt((.09 + .16) / 2), sqrt(.04).
+    np.testing.assert_allclose(comparing.root_mean_square(residuals), [0.125**0.5, 0.2], rtol=1e-6)
+
+
+def simulated(number=8):
+    """A simulated recording by both sensors."""
+    world = sim.make_world(CONFIG)
+
+    @jax.jit
+    @jax.vmap
+    def record(key):
+        scene_key, *keys = jax.random.split(key, 3)
+        scene = sim.random_scene(scene_key, world, jnp.array([0, 1, 2]))
+        found = {"places": scene.layout.position[0]}
+        for m, sensor in enumerate(world.sensors):
+            look_key, noise_key = jax.random.split(keys[m])
+            _, scene = sim.look(look_key, world, scene, m, jnp.int32(0))
+            data, rays = sim.place(world.arena, scene.layout, scene.poses), sensor.directions
+            found[f"{sensor.name}_scans"] = sim.scan(
+                noise_key, sensor, world.arena, data, scene.layout, scene.light, m, jnp.array(rays)
+            )
+            found[f"{sensor.name}_poses"] = scene.poses[m]
+        return found
+
+    found = record(jax.random.split(jax.random.key(1), number))
+    return {name: np.array(values) for name, values in found.items()}
+
+
+@pytest.mark.slow
+def test_recordings_are_compared_with_simulated_windows(tmp_path, monkeypatch):
+    monkeypatch.setattr(comparing, "NUM_SIMULATED", 24)
+    run, path, content = tmp_path / "run", tmp_path / "recorded.npz", simulated()
+    with RunDirectory.create(run, Settings("smoke", 0, CONFIG)) as created:
+        save_models(created, jaxsense.init(jax.random.key(0), CONFIG))
+    np.savez(path, **content)
+    found = jaxsense.compare_scans(run, path)
+    assert [*found.of_sensors] == ["camera", "lidar"]
+    for pairs in found.of_sensors.values():
+        # A simulated recording is as far from simulated windows as they are from each other.
+        recorded, usual = pairs.apart
+        assert len(pairs.recorded) == 8
+        assert 0 < recorded < 1.5 * usual
+    # Each beam is off by .01 m, and so is each of the windows that it is compared with.
+    assert found.of_sensors["lidar"].apart[0] == pytest.approx(0.0125, abs=0.003)
+    assert found.picture == path.with_name("recorded.npz.svg")
+    assert found.picture.read_bytes().startswith(b"<?xml")
+    camera, lidar = str(found).splitlines()
+    assert camera.startswith("camera: 8 recorded windows are 0.0")
+    assert lidar.startswith("lidar: 8 recorded windows are 0.01")
+    with pytest.raises(FileExistsError, match=r"recorded\.npz\.svg"):
+        jaxsense.compare_scans(run, path)
+
+    # Another scanner is too far by .2 m, and the last three looks are behind the robot.
+    content = {name: x for name, x in content.items() if not name.startswith("camera")}
+    content["lidar_scans"] = content["lidar_scans"] + 0.2
+    content["lidar_poses"][-3:, 2] += np.pi
+    np.savez(path, **content)
+    found = jaxsense.compare_scans(run, path, tmp_path / "picture.png")
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert [*found.of_sensors] == ["lidar"]
+    assert len(found.of_sensors["lidar"].recorded) == 5
+    assert 0.13 < found.of_sensors["lidar"].apart[0] < 0.22
+    content["lidar_poses"][:-3, 2] += np.pi
+    np.savez(path, **content)
+    with pytest.raises(ValueError, match="lidar_scans: no window around a PoI was recorded"):
+        jaxsense.compare_scans(run, path, tmp_path / "another.svg")
+    assert not list(tmp_path.glob("another*"))
