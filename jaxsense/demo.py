@@ -19,7 +19,7 @@ from jaxsense.run.compilation import Compiler
 from jaxsense.run.missions import Played
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
-from jaxsense.show import animation, html, tables
+from jaxsense.show import film, page, tables
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.tasks import PRETRAINED, load_pretrained
 
@@ -107,28 +107,23 @@ def _page(
     table: tables.Table,
 ) -> str:
     """The page, with the animations in it."""
-    lasts = max(
-        animation.duration_of(scenario.config, each.recording.end) for each in played.values()
-    )
-
-    def film(name: str) -> str:
-        recording, title = played[name].recording, f"{name} policy"
-        return animation.draw(
-            scenario.config,
-            recording.records,
-            recording.end,
-            models.fusion,
-            scenario.fields_of_view,
-            title,
-            lasts,
+    config, fields = scenario.config, scenario.fields_of_view
+    recordings = {name: each.recording for name, each in played.items()}
+    lasts = max(film.duration_of(config, each.end) for each in recordings.values())
+    films = {
+        name: page.drawing(
+            film.draw(
+                config, each.records, each.end, models.fusion, fields, f"{name} policy", lasts
+            )
         )
-
-    return html.render(
+        for name, each in recordings.items()
+    }
+    return page.fill(
         "demo.html.jinja",
         preset=arguments.preset,
         seed=arguments.seed,
         other=next(name for name in PRETRAINED if name != arguments.preset),
-        films=[html.films({name: film(name) for name in played})],
+        films=[films],
         averages=_AVERAGES,
         table=table,
         sentence=_sentence(arguments.policy),

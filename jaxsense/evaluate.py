@@ -22,7 +22,7 @@ from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
-from jaxsense.show import animation, drawing, mission_plots, page, tables
+from jaxsense.show import drawing, film, page, result_plots, tables
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare
 from jaxsense.summary.blocks import policies as policies_of
@@ -122,7 +122,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         seconds = time.perf_counter() - compiled
     block = summary.missions(scenario, found.metrics)
     draw = functools.partial(
-        animation.draw,
+        film.draw,
         config,
         found.recording.records,
         found.recording.end,
@@ -179,7 +179,7 @@ def _write(
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
-            plot = mission_plots.policies(found["mission"], found["num_pois"])
+            plot = result_plots.policies(found["mission"], found["num_pois"])
             files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
@@ -193,7 +193,7 @@ def _report(run: Path, config: Config) -> Path:
     made = [_evaluation(config, own["mission"], own), *found.values()]
     places = [each for each in made if _is_alike(each)]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
-        files.write(run / "teams.svg", drawing.svg(mission_plots.teams(places)))
+        files.write(run / "teams.svg", drawing.svg(result_plots.places(places)))
     files.write(path, page.render(run, config, own, found))
     return path
 

@@ -7,6 +7,7 @@ import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
@@ -29,8 +30,7 @@ from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
-from jaxsense.show import tables, tensorboard
-from jaxsense.show.artist import Artist
+from jaxsense.show import tables, terminal
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare, statistics
 from jaxsense.summary.blocks import Header, Made
@@ -177,7 +177,7 @@ def parse(
         arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
         mission.require_playable(arguments.config, policies)
         if arguments.tensorboard:
-            tensorboard.require()
+            terminal.require_tensorboard()
         seeds.check_range(arguments.seed, arguments.num_seeds)
         if arguments.file is not None and arguments.preset != stored.preset:
             raise ConfigError("config", str(arguments.file), "has a preset; omit --preset")
@@ -283,22 +283,26 @@ def _train_one(
     """Trains one seed and writes its run; returns why it failed, if it did."""
     records = [run.append_metrics]
     if arguments.tensorboard:
-        records.append(tensorboard.make_writer(run.path / "tensorboard"))
+        records.append(terminal.tensorboard(run.path / "tensorboard"))
     if several := compare.several_origins(run.made("mission")):
         _warn(f"{run.path}: {several}")
-    config, checkpoints, artist = run.settings.config, run.checkpoints, Artist()
+    config, checkpoints = run.settings.config, run.checkpoints
     key = jax.random.key(run.settings.seed)
-    with Display(console, records, quiet=arguments.quiet) as display, artist:
+    # In one thread of its own, because matplotlib does not work in several at once.
+    with (
+        Display(console, records, quiet=arguments.quiet) as display,
+        ThreadPoolExecutor(1, "draw") as artist,
+    ):
         monitor.begin(display.show)
         try:
             learned = pipeline.learn(key, config, programs, monitor, checkpoints)
-            artist.draw(run.path, lambda: _report().of_training(config, learned))
+            drawn = [artist.submit(lambda: _drawing().of_training(config, learned))]
             played = pipeline.play(key, config, programs, monitor, learned, checkpoints)
         except StageError as error:
             _warn(f"{error}; earlier checkpoints are in {run.path}")
             return {run.settings.seed: str(error)}
-        artist.draw(run.path, lambda: _report().of_missions(config, learned, played))
-        drawn = artist.finished()
+        drawn.append(artist.submit(lambda: _drawing().of_missions(config, learned, played)))
+        pictures = drawn[0].result() | drawn[1].result()
         monitor.check_stop()
         header = _header(run, run.sign("mission"))
         found: summary.Summary = {
@@ -307,7 +311,7 @@ def _train_one(
             **learned.results,
             "mission": played.missions,
         }
-        _report().write(run, drawn[run.path], found)
+        _drawing().write(run.path, config, pictures, found)
         monitor.check_stop()
         # Last, for it marks the run as finished.
         rundir.write_json(run.path / "summary.json", found)
@@ -325,15 +329,16 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
-    _report().write(run, _report().of_seeds(run.settings.config, curves, means), found)
+    config = run.settings.config
+    _drawing().write(run.path, config, _drawing().of_seeds(config, curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
 
 
-def _report() -> ModuleType:
+def _drawing() -> ModuleType:
     """The module that draws and writes pages, imported when the first picture is drawn."""
-    from jaxsense.show import report  # noqa: PLC0415 (matplotlib takes long to import)
+    from jaxsense.show import drawing  # noqa: PLC0415 (matplotlib takes long to import)
 
-    return report
+    return drawing
 
 
 def _warn(text: str) -> None:

@@ -1,4 +1,4 @@
-"""The colours of classes and robots in plots and animations."""
+"""The colours of classes, robots and policies in plots and films."""
 
 import itertools
 import math
@@ -9,96 +9,62 @@ from numpy.typing import ArrayLike
 
 from jaxsense.config import ArenaConfig
 
-RGB = tuple[float, float, float]
 MARKERS = "oDs^vPX<>pdh"
 SOFT = "#59616e"
 """Colour of what matters less."""
 
-_ROBOT_COLOURS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
-_POLICY_COLOURS = {
-    "latent": ("#1558b0", "#2a7cc6"), "greedy": ("#b84300", "#bd5f21"),
-    "bayes": ("#00805f", "#2c8c71"), "optimal": ("#5e0d2b", "#f05983"),
-    "nearest": ("#cd79aa", "#cc69a4"), "auction": ("#d00dd4", "#d93fff"),
-    "rollout": ("#b79710", "#b7960a"), "naive": ("#523a05", "#917b4f"),
-    "naive_2": ("#05475b", "#47def1"), "naive_3": ("#d00e4d", "#ff8bb5"),
-    "random": ("#1711c8", "#af9aff"), "network": ("#0c0054", "#f0d800"),
+_ROBOTS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
+# They differ also for those who see no red or no green.
+_POLICIES = {
+    "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
+    "nearest": "#cd79aa", "auction": "#d00dd4", "rollout": "#b79710", "naive": "#523a05",
+    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8", "network": "#0c0054",
 }  # fmt: skip
-_OTHER_POLICY = ("#0fb851", "#0cc75f"), "*"  # a custom one
-ON_DARK = dict([*_POLICY_COLOURS.values(), _OTHER_POLICY[0]])
-"""Counterparts of the colours of policies on a dark page, where they must differ as well."""
+_STYLES = dict(zip(_POLICIES, zip(_POLICIES.values(), MARKERS, strict=True), strict=True))
+_OWN_POLICY = "#0fb851", "*"
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _TOGETHER = 0.05  # latent distance of classes that a picture cannot separate
-_DARKEST, _LIGHTEST = -0.75, 0.6
 
 
 def modality_colour(modality: int) -> str:
     """The colour of the robots that carry a sensor, by its index."""
-    return _ROBOT_COLOURS[modality % len(_ROBOT_COLOURS)]
+    return _ROBOTS[modality % len(_ROBOTS)]
 
 
 def policy_colour(name: str) -> str:
-    """The colour of a policy, the same in all plots.
-
-    Colours differ also for those who see no red or no green, and so do those of `ON_DARK`.
-    """
-    return _POLICY_COLOURS.get(name, _OTHER_POLICY[0])[0]
+    """The colour of a policy, the same in all plots."""
+    return _STYLES.get(name, _OWN_POLICY)[0]
 
 
 def policy_marker(name: str) -> str:
     """The marker of a policy, the same in all plots."""
-    markers = dict(zip(_POLICY_COLOURS, MARKERS, strict=True))
-    return markers.get(name, _OTHER_POLICY[1])
+    return _STYLES.get(name, _OWN_POLICY)[1]
 
 
 def series(number: int) -> dict[str, Any]:
-    """The colour and marker of a curve that belongs to no policy, sensor or class, by its number.
+    """Colour and marker of a curve of no policy, sensor or class: those of a policy, in turn."""
+    colour, marker = [*_STYLES.values()][number % len(_STYLES)]
+    return {"color": colour, "marker": marker}
 
-    They are those of policies, one after another, since they differ for everybody.
+
+def class_colour(arena: ArenaConfig, label: str) -> str:
+    """The colour of a class as `#rrggbb`, unique in the arena.
+
+    It is the colour of the PoIs. If an earlier class has it, it is a darker or lighter shade: half
+    way to black or to white or, if those are taken too, the one that differs most from all others.
     """
-    return {
-        "color": [*_POLICY_COLOURS.values()][number % len(_POLICY_COLOURS)][0],
-        "marker": MARKERS[number % len(MARKERS)],
-    }
+    classes, taken = arena.classes, list[np.ndarray]()
+    # More than classes, also for black or white, which cannot be darker or lighter.
+    tones = (0.0, -0.5, 0.5, *np.linspace(-0.75, 0.6, 4 * len(classes)))
 
+    def distance(shade: np.ndarray) -> float:
+        return min([_APART, *(math.dist(shade, other) for other in taken)])
 
-def class_marker(index: int) -> str:
-    """The marker of a class, by its place in `arena.classes`."""
-    return MARKERS[index % len(MARKERS)]
-
-
-def class_colour(arena: ArenaConfig, label: str) -> RGB:
-    """The colour of a class, RGB in [0, 1], unique in the arena.
-
-    It is the colour of the PoIs or, if an earlier class has it, a shade: half as bright, half way
-    to white or, if those are taken too, the shade that differs most from all others.
-
-    Args:
-      arena: with the colours.
-      label: of the class.
-    """
-    classes, taken = arena.classes, []
     for each in classes[: classes.index(label) + 1]:
-        # More than classes, also for black or white, which cannot be darker or lighter.
-        tones = (0.0, -0.5, 0.5, *np.linspace(_DARKEST, _LIGHTEST, 4 * len(classes)).tolist())
-        shades = [_shade(arena.colours[each.split(" ")[0]], tone) for tone in tones]
-        taken.append(max(shades, key=lambda shade: _distance(shade, taken)))
-    return taken[-1]
-
-
-def _shade(colour: RGB, tone: float) -> RGB:
-    """A colour, darker (tone < 0) or lighter (tone > 0), up to black at -1 and white at 1."""
-    red, green, blue = (part + abs(tone) * ((tone > 0) - part) for part in colour)
-    return red, green, blue
-
-
-def _distance(colour: RGB, others: list[RGB]) -> float:
-    """Distance of a colour from the nearest of others, at most `_APART`."""
-    return min([_APART, *(math.dist(colour, other) for other in others)])
-
-
-def as_hex(colour: RGB) -> str:
-    """RGB in [0, 1] as `#rrggbb`."""
-    return "#" + "".join(f"{round(255 * part):02x}" for part in colour)
+        paint = np.array(arena.colours[each.split(" ")[0]])
+        shades = [paint + abs(tone) * ((tone > 0) - paint) for tone in tones]
+        taken.append(max(shades, key=distance))
+    return "#" + "".join(f"{round(255 * float(part)):02x}" for part in taken[-1])
 
 
 def as_srgb(linear: np.ndarray) -> np.ndarray:
@@ -121,11 +87,6 @@ def plane(means: np.ndarray) -> list[int]:
 
 
 def in_plane(values: ArrayLike, shown: list[int]) -> np.ndarray:
-    """`[..., D]` as `[..., 2]`: the latent dimensions of `plane`, or zero.
-
-    Args:
-      values: `[..., D]`.
-      shown: one or two dimensions.
-    """
+    """`[..., D]` as `[..., 2]`: the one or two latent dimensions of `plane`, or zero."""
     values = np.asarray(values)[..., shown]
     return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, 1)])[..., :2]

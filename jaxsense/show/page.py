@@ -1,22 +1,36 @@
 """The report of a run: one page that needs no other file."""
 
+import base64
 import contextlib
 import json
-import operator
+import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import jinja2
+from markupsafe import Markup
 
 from jaxsense.config import PRESETS, Config, as_plain
+from jaxsense.config.options import command
 from jaxsense.core import inside
-from jaxsense.show import html, tables
-from jaxsense.show.mission_plots import counted
+from jaxsense.show import tables
 from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
 from jaxsense.summary.metrics import mean
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")
 """Films of a run's own missions in one arena, without the suffix of their files."""
+_SVG = "{http://www.w3.org/2000/svg}"
+_TAG = re.compile("circle|ellipse|g|line|path|polyline|rect|style|svg|text|title").fullmatch
+_ATTRIBUTE = re.compile(
+    "class|c?x|c?y|d|(fill|stroke)?-?opacity|fill|height|points|r|role|rx|ry|"
+    "stroke(-dasharray|-dashoffset|-width)?|style|transform|viewBox|width|[xy][12]"
+).fullmatch
+_STYLE = re.compile(r"--film:[\d.]+s \d+|animation:[\w .,()-]*").fullmatch
+_KEY_FRAMES = re.compile(r"@keyframes k[0-9a-f]{10}\{(?:[\d.]+%\{[a-z-]+:[\w.,()-]*\})*\}\n?")
 
 
 def render(
@@ -38,12 +52,11 @@ def render(
       ConfigError: if the summary is of other classes.
     """
     here = _missions(f"{summary['preset']} preset", summary["mission"], run / "policies.svg")
-    plots = {path.stem: path for path in inside.matching(run, f"{EVALUATIONS}/*.svg")}
     elsewhere = [
-        _missions(_title(found, summary), found["mission"], plots.get(name))
+        _missions(_title(found, summary), found["mission"], run / EVALUATIONS / f"{name}.svg")
         for name, found in (evaluations or {}).items()
     ]
-    return html.render(
+    return fill(
         "report.html.jinja",
         run=run,
         argument=lambda path: shlex.quote(str(path)),
@@ -61,12 +74,56 @@ def render(
         ],
         paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
-        counted=_counted,
+        counted=tables.counted,
         changed=_changed(config, summary["preset"]),
         config=json.dumps(as_plain(config), indent=2),
-        plot=lambda name: _data(run / f"{name}.svg"),
+        plot=lambda name: _picture(run / f"{name}.svg"),
         films=_films(run),
     )
+
+
+def fill(template: str, **values: object) -> str:
+    """Fills a template of this package; text is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jaxsense.show", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(template).render(command=command, **values)
+
+
+def drawing(film: str) -> Markup:
+    """The elements, attributes and key frames of a film; nothing if the text is no SVG.
+
+    What no film draws is left out: a file may come from anywhere.
+    """
+    try:
+        root = ElementTree.fromstring(film)
+        text = ElementTree.tostring(_copied(root), encoding="unicode")
+    except (ElementTree.ParseError, RecursionError):
+        return Markup()
+    return Markup(text if root.tag == f"{_SVG}svg" else "")
+
+
+def _copied(element: Element) -> Element:
+    """A copy of what films are made of, without the namespace, which HTML knows."""
+    given = element.attrib.items()
+    kept = {name: x for name, x in given if _ATTRIBUTE(name) and (name != "style" or _STYLE(x))}
+    copy = Element(element.tag.removeprefix(_SVG), kept)
+    is_sheet = copy.tag == "style"
+    copy.text = "".join(_KEY_FRAMES.findall(element.text or "")) if is_sheet else element.text
+    copy.extend([_copied(child) for child in element if _TAG(child.tag.removeprefix(_SVG))])
+    return copy
+
+
+def _films(run: Path) -> list[dict[str, Markup]]:
+    """The films of a run by name, those of the same arena together, its own first."""
+    files = inside.matching(run, "mission*.svg")
+    found = {path.stem: drawing(inside.read(path).decode(errors="replace")) for path in files}
+    own = {name: found.pop(name) for name in OWN_FILMS if name in found}
+    return [group for group in (own, *({name: x} for name, x in found.items())) if group]
 
 
 def _order(config: Config) -> str:
@@ -78,25 +135,7 @@ def _order(config: Config) -> str:
     return "robots take the most valuable look first"
 
 
-def _films(run: Path) -> list[html.Films]:
-    """The films of a run, those of the same arena together, its own first."""
-    found = {
-        path.stem: inside.read(path).decode(errors="replace")
-        for path in sorted(inside.matching(run, "*.svg"), key=operator.attrgetter("stem"))
-        if path.name.startswith("mission")
-    }
-    own = {name: film for name, film in found.items() if name in OWN_FILMS}
-    others = ({name: film} for name, film in found.items() if name not in own)
-    return [html.films(group) for group in (own, *others) if group]
-
-
-def _counted(devices: Sequence[str]) -> str:
-    """Devices by kind; that a single one is single is not worth telling."""
-    numbers = {kind: devices.count(kind) for kind in devices}
-    return ", ".join(f"{n} \u00d7 {kind}" if n > 1 else kind for kind, n in numbers.items())
-
-
-def _missions(title: str, missions: Missions, plot: Path | None) -> dict[str, object]:
+def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
     """Section of the page about missions in the same arenas."""
     played = cases(missions)
     number = max(mean(case["episodes"]) for case in played.values())
@@ -108,7 +147,7 @@ def _missions(title: str, missions: Missions, plot: Path | None) -> dict[str, ob
         "tables": [table for table in found if table.rows],
         "details": tables.all_of_missions(missions),
         "sizes": compare.detection_sizes(missions),
-        "plot": plot and _data(plot),
+        "plot": _picture(plot),
     }
 
 
@@ -119,14 +158,14 @@ def _title(found: Evaluation, summary: Summary) -> str:
     made = "".join(f"; {name} {value}" for name, (_, value) in changed.items())
     return (
         f"Evaluation: {found['num_pois']} PoIs in {found['side']:g} m; robots: "
-        f"{counted(found['robots'])}; seed {', '.join(map(str, sorted(seeds)))}{made}"
+        f"{tables.counted(found['robots'])}; seed {', '.join(map(str, sorted(seeds)))}{made}"
     )
 
 
-def _data(path: Path) -> str | None:
-    """A picture as a data URI; None if there is no such file."""
+def _picture(path: Path) -> str | None:
+    """An SVG as the source of an `img`, in which no script runs; None if there is no file."""
     with contextlib.suppress(FileNotFoundError):
-        return html.picture(inside.read(path))
+        return f"data:image/svg+xml;base64,{base64.b64encode(inside.read(path)).decode()}"
     return None
 
 

@@ -1,22 +1,12 @@
 """The tables of a run, for the page and the terminal, from the one table of metrics."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping
-from typing import cast
+from collections.abc import Iterable, Mapping, Sequence
 
 from jaxsense.config import ConfigError
 from jaxsense.mission import is_fault
 from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
-from jaxsense.summary.blocks import (
-    AGENTS,
-    BELIEF,
-    DETECTORS,
-    JMVAE,
-    MISSIONS,
-    STAGES,
-    Agent,
-    policies,
-)
+from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES, policies
 from jaxsense.summary.compare import AS_ACCURATE
 from jaxsense.summary.metrics import Number, mean, text
 
@@ -34,12 +24,6 @@ _PAPER = {
     "num_permutations": "384",
     "env_steps": "2,000 epochs",
 }
-_RULES = ("nearest", "auction", "rollout")  # written by hand, and learned by none
-_NO_BOUND = (
-    "The optimal policy maximises the expected rewards of looks, but rewards are read from the "
-    "map: on a poor map, or over few starts, another policy can score higher. If it led by more "
-    "than 1 % and two standard errors, the table would name no optimal policy."
-)
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
 
@@ -53,7 +37,6 @@ class Table:
       rows: the name of each, and a text for each column.
       meanings: explanations, by names of columns.
       best: rows and columns of values to highlight.
-      note: a text below it; empty if there is nothing to add.
     """
 
     caption: str
@@ -61,7 +44,6 @@ class Table:
     rows: list[tuple[str, list[str]]]
     meanings: dict[str, str] = dataclasses.field(default_factory=dict)
     best: frozenset[tuple[int, int]] = frozenset()
-    note: str = ""
 
 
 def _table(
@@ -87,26 +69,7 @@ def agents(results: Results) -> Table:
     """The Q-networks compared with other policies on the map."""
     keys = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal", "optimal_states"
     metrics = [AGENTS[key] for key in (*keys, "num_states")]
-    caption = "Policies of a robot alone on the map: mean reward"
-    table = _table(caption, results["dqn"], metrics)
-    above = [
-        text for name, agent in results["dqn"].items() if (text := _above_optimal(name, agent))
-    ]
-    return dataclasses.replace(table, note=" ".join([*above, _NO_BOUND]) if above else "")
-
-
-def _above_optimal(name: str, agent: Agent) -> str:
-    """Names the policies whose mean reward is shown above the optimal one; empty without any."""
-    if agent["optimal"] is None:
-        return ""
-
-    def shown(key: str) -> float:
-        return round(mean(cast(Number, AGENTS[key].value(agent))), AGENTS[key].digits)
-
-    rivals = "return", "greedy", "naive", "random"
-    above = [AGENTS[key].label for key in rivals if shown(key) > shown("optimal")]
-    verb = "get" if len(above) > 1 else "gets"
-    return f"For {name}, {' and '.join(above)} {verb} more than optimal." if above else ""
+    return _table("Policies of a robot alone on the map: mean reward", results["dqn"], metrics)
 
 
 def latent_space(results: Results) -> Table:
@@ -120,32 +83,22 @@ def latent_space(results: Results) -> Table:
 def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
     """Classes that each sensor alone, and all together, identify with certainty.
 
-    Args:
-      results: of the run.
-      classes: of the arena.
-
-    Returns:
-      A row for each class: the result here, and the paper's if it has the same classes and sensors.
-
-    Raises:
-      ConfigError: if the results are of other classes.
+    Next to each is the paper's result if it has the same classes and sensors. Raises `ConfigError`
+    if the results are of other `classes`.
     """
     block = results["jmvae"]
     columns = sorted(block["unambiguous"], key="joint".__eq__)
-    blocks = block["unambiguous"], block["sigma_norm"], block["consistent"]
+    blocks = block["unambiguous"], block["consistent"], block["sigma_norm"]
     if {len(each.get(name, ())) for each in blocks for name in columns} - {len(classes)}:
         raise ConfigError("jmvae", columns, f"must each have a value for {len(classes)} classes")
     is_paper = set(classes) == _PAPER_CLASSES and set(columns) == {"camera", "lidar", "joint"}
 
     def cell(c: int, name: str) -> str:
-        holds = mean(block["unambiguous"][name][c])
+        holds, consistent, norm = (mean(each[name][c]) for each in blocks)
         here = _YES_OR_NO.get(holds, f"{holds:.0%}")  # of several seeds
         if is_paper:
             here += f" / {_YES_OR_NO[name == 'joint' or (classes[c], name) in _PAPER_CERTAIN]}"
-        norm, consistent = (mean(block[key][name][c]) for key in ("sigma_norm", "consistent"))
-        return " ".join(
-            part.replace(" ", "\u00a0") for part in (here, f"({consistent:.1%}, {norm:.2f})")
-        )
+        return f"{here} ({consistent:.1%}, {norm:.2f})"
 
     caption = "Classes identified with certainty" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
@@ -167,12 +120,7 @@ def paper(results: Results) -> Table | None:
 
 
 def missions(block: Missions, caption: str) -> Table:
-    """The policies that played in the same arenas, with the best values marked.
-
-    Args:
-      block: `mission` of a summary or of an evaluation.
-      caption: of the table.
-    """
+    """The policies that played in the same arenas, with the best values marked."""
     return _missions(policies(block), caption)
 
 
@@ -198,25 +146,33 @@ _UNFINISHED = {
 def _missions(played: Mapping[str, Case], caption: str) -> Table:
     keys = "accuracy", "observations_per_poi", "time_s", "collisions"
     table = _table(caption, played, [MISSIONS[key] for key in keys])
-    values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
-    most = max((accuracy for accuracy, *_ in values), default=0.0)
-    able = [row for row in values if row[0] >= most - AS_ACCURATE]
-    # A value alone is not the best of any.
-    best = {(r, c) for r, row in enumerate(values) for c in range(1, 3) if row in able
-            and len(able) > 1 and row[c] == min(each[c] for each in able)}  # fmt: skip
-    best |= {(r, 0) for r, row in enumerate(values) if len(values) > 1 and row[0] == most}
     rows = []
     for (name, texts), case in zip(table.rows, played.values(), strict=True):
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
-        unfinished = ", ".join(
-            f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items()
-        )
-        against = [_percent(case["time_s"], played["naive"]["time_s"])] if "naive" in played else []
-        rows.append((name, [*texts[:3], *against, *texts[3:], unfinished]))
-    against = ["against naive"] if "naive" in played else []
-    columns = [*table.columns[:3], *against, *table.columns[3:], "unfinished"]
-    meanings = {**table.meanings, **(_AGAINST if against else {}), **_UNFINISHED}
-    return Table(caption, columns, rows, meanings, frozenset(best))
+        words = (f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items())
+        rows.append((name, [*texts, ", ".join(words)]))
+    columns, meanings = [*table.columns, "unfinished"], {**table.meanings, **_UNFINISHED}
+    if "naive" in played:
+        columns.insert(3, "against naive")
+        meanings |= _AGAINST
+        for (_, texts), case in zip(rows, played.values(), strict=True):
+            texts.insert(3, _percent(case["time_s"], played["naive"]["time_s"]))
+    values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
+    return Table(caption, columns, rows, meanings, _best(values))
+
+
+def _best(values: list[list[float]]) -> frozenset[tuple[int, int]]:
+    """The highest accuracy, and the least looks and time of the rows that are about as accurate."""
+    most = max((accuracy for accuracy, *_ in values), default=0.0)
+    able = [row for row in values if row[0] >= most - AS_ACCURATE]
+    least = [min(column) for column in zip(*able, strict=True)]
+    found = set[tuple[int, int]]()
+    for r, row in enumerate(values):
+        # A value alone is not the best of any.
+        found |= {(r, 0)} if row[0] == most and len(values) > 1 else set()
+        if row in able and len(able) > 1:
+            found |= {(r, c) for c in (1, 2) if row[c] == least[c]}
+    return frozenset(found)
 
 
 ALL_OF_MISSIONS = {
@@ -253,37 +209,23 @@ def _percent(value: Number, reference: Number) -> str:
 def cards(results: Results) -> list[tuple[str, str, str]]:
     """The main results: a number, its meaning, and figures to compare it with."""
     found, played = [], cases(results["mission"])
-    if own := played.get("latent"):
-        rules = _fastest_rule(played)
-        for key, what, others in (
-            ("observations_per_poi", "looks per PoI", ("naive",)),
-            ("time_s", "median seconds per mission", ("naive", *rules)),
-            ("accuracy", "of PoIs right", ("naive", "random")),
-        ):
-            beside = []
-            for name in (each for each in others if each in played):
-                beside.append(f"{name} {_short(key, played[name][key])}")
-                if name == "naive" and key != "accuracy":
-                    beside.append(_percent(own[key], played[name][key]))
+    for key, what, others in (
+        ("observations_per_poi", "looks per PoI", ("naive",)),
+        ("time_s", "median seconds per mission", ("naive",)),
+        ("accuracy", "of PoIs right", ("naive", "random")),
+    ):
+        if own := played.get("latent"):
+            beside = [
+                f"{name} {_short(key, played[name][key])}" for name in others if name in played
+            ]
+            if "naive" in played and key != "accuracy":
+                beside.append(_percent(own[key], played["naive"][key]))
             found.append((_short(key, own[key]), what, ", ".join(beside)))
     for modality, agent in results["dqn"].items():
-        states = f"{mean(agent['num_states']):,.0f} states of the map"
-        if agent["optimal_states"] is None:  # without an optimum to compare with
-            continue
-        number = f"{mean(agent['optimal_states']):,.0f}"
-        found.append((number, f"of {states} played optimally", modality))
+        if agent["optimal_states"] is not None:  # with an optimum to compare with
+            what = f"of {mean(agent['num_states']):,.0f} states of the map played optimally"
+            found.append((f"{mean(agent['optimal_states']):,.0f}", what, modality))
     return found
-
-
-def _fastest_rule(played: Mapping[str, Case]) -> list[str]:
-    """The fastest of the rules that are as accurate as the latent policy, if one was played."""
-    least = mean(played["latent"]["accuracy"]) - AS_ACCURATE
-    able = {
-        name: mean(played[name]["time_s"])
-        for name in _RULES
-        if name in played and mean(played[name]["accuracy"]) >= least
-    }
-    return sorted(able, key=lambda name: able[name])[:1]
 
 
 def _short(key: str, value: Number) -> str:
@@ -294,14 +236,14 @@ def _short(key: str, value: Number) -> str:
 
 
 def times(results: Results, timing: Timing) -> list[Table]:
-    """The time of each stage, in order, and the speed of Q-learning.
-
-    Args:
-      results: of the run.
-      timing: of the run.
-    """
+    """The time of each stage, in order, and the speed of Q-learning."""
     speed = AGENTS["env_steps"], AGENTS["env_steps_per_s"]
     return [
         _table("Stages, which compile and run side by side", timing["stages"], STAGES.values()),
         _table("Training of the Q-networks", results["dqn"], speed),
     ]
+
+
+def counted(names: Sequence[str]) -> str:
+    """How often each name is there: `2 camera, 1 lidar`."""
+    return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names))

@@ -1,16 +1,20 @@
-"""Shows the progress of a program."""
+"""Shows the progress of a program: on a terminal, as lines, or as event files for TensorBoard."""
 
+import importlib
 import io
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import rich.box
 import rich.console
-import rich.progress
 import rich.table
 import rich.text
+from rich import progress
 from rich.table import Column
 
+from jaxsense.config import ConfigError
+from jaxsense.core import inside
 from jaxsense.run.output import say
 from jaxsense.show.tables import Table
 
@@ -28,30 +32,22 @@ class Display:
         records: Sequence[Callable[..., None]] = (),
         quiet: bool = False,
     ):
-        """Shows progress on a console.
-
-        Args:
-          console: to show it on.
-          records: receive the metrics of every report.
-          quiet: record, but show nothing.
-        """
+        """Shows progress on a console; `records` receive the metrics of every report."""
         self._console, self._records, self._quiet = console, records, quiet
-        self._tasks: dict[str, rich.progress.TaskID] = {}
-        self._first: dict[str, tuple[float, int]] = {}
+        self._tasks: dict[str, progress.TaskID] = {}
         self._last: dict[str, float] = {}
         self._begin = time.perf_counter()
-        columns = rich.progress
-        is_wide = console.width >= _WIDE
-        self._progress = rich.progress.Progress(
-            columns.TextColumn("{task.description}", table_column=Column(min_width=15)),
-            *([columns.BarColumn()] if is_wide else []),
-            *(
-                columns.TextColumn(f"{{task.fields[{name}]}}", table_column=Column(min_width=width))
-                for name, width in {"count": 10, "rate": 7, "left": 10, "metrics": 0}.items()
-            ),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
+        columns = [
+            progress.TextColumn("{task.description}", table_column=Column(min_width=15)),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("{task.fields[metrics]}"),
+        ]
+        if console.width < _WIDE:
+            del columns[1]
+        is_live = console.is_terminal and not quiet
+        self._progress = progress.Progress(*columns, console=console, disable=not is_live)
 
     def __enter__(self) -> "Display":
         self._progress.start()
@@ -75,67 +71,33 @@ class Display:
         if self._quiet:
             return
         text = "  ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        if self._console.is_terminal:
-            self._show_bar(stage, done, total, text)
-        else:
-            self._show_line(stage, done, total, text)
-
-    def _show_bar(self, stage: str, done: int, total: int, text: str) -> None:
         if stage not in self._tasks:
-            self._tasks[stage] = self._progress.add_task(
-                stage, total=None, count="compiling", rate="", left="", metrics=""
-            )
-        if not total:
-            return
-        rate, left = self._rate(stage, done, total, time.perf_counter())
-        self._progress.update(
-            self._tasks[stage],
-            completed=done,
-            total=total,
-            count=f"{done}/{total}",
-            rate=rate,
-            left=left,
-            metrics=text,
-        )
-        # Stages without a total never report that they end.
+            self._tasks[stage] = self._progress.add_task(stage, total=None, metrics="compiling")
+        if total:
+            number = self._tasks[stage]
+            self._progress.update(number, completed=done, total=total, metrics=text)
         for other in self._progress.tasks:
-            if other.total is None and other.description != stage:
-                self._progress.update(other.id, visible=False)
-
-    def _rate(self, stage: str, done: int, total: int, now: float) -> tuple[str, str]:
-        """Rate and time left as text; empty at the end of the first chunk."""
-        since, before = self._first.setdefault(stage, (now, done))
-        if done <= before or now <= since:
-            return "", ""
-        rate = (done - before) / (now - since)
-        return f"{rate:.0f}/s", f"{(total - done) / rate:.0f} s left"
+            # Stages without a total never report that they end.
+            is_waiting = other.total is None and other.description != stage
+            self._progress.update(other.id, visible=not is_waiting)
+        if not self._console.is_terminal:
+            self._show_line(stage, done, total, text)
 
     def _show_line(self, stage: str, done: int, total: int, text: str) -> None:
         """Prints a line for each stage every few seconds, always its first and last."""
-        now = time.perf_counter()
-        clock = f"{now - self._begin:6.1f} s  {stage}"
-        if not total:
-            if stage not in self._last:
-                self._last[stage] = now
-                say(f"{clock}: compiling")
+        now, is_first = time.perf_counter(), stage not in self._last
+        is_over = total and done >= total
+        if not (is_first or is_over or now - self._last[stage] >= _LINE_PERIOD):
             return
-        is_first = stage not in self._first
-        rate, left = self._rate(stage, done, total, now)
-        if done < total and not is_first and now - self._last[stage] < _LINE_PERIOD:
-            return
-        self._last[stage] = now
-        parts = [f"{done} of {total}", rate, left]
-        progress = "done" if done == total == 1 else ", ".join(part for part in parts if part)
-        say(f"{clock}: {progress}  {text}".rstrip())
+        self._last[stage] = now if total else now - _LINE_PERIOD
+        left = self._progress.tasks[self._tasks[stage]].time_remaining
+        state = f"{done} of {total}" if total else "compiling"
+        state += f", {left:.0f} s left" if left else ""
+        say(f"{now - self._begin:6.1f} s  {stage}: {state}  {text}".rstrip())
 
 
 def as_text(console: rich.console.Console, table: Table) -> str:
-    """A table as a console shows it; markup in cells is not interpreted.
-
-    Args:
-      console: on which it will be printed.
-      table: the table.
-    """
+    """A table as a console shows it; markup in cells is not interpreted."""
     drawn = rich.table.Table("", box=rich.box.SIMPLE, pad_edge=False, title_justify="left")
     drawn.title = rich.text.Text(table.caption)
     for name in table.columns:
@@ -152,6 +114,27 @@ def as_text(console: rich.console.Console, table: Table) -> str:
         console = rich.console.Console(file=nowhere, width=_ENDLESS)
     with console.capture() as captured:
         console.print(drawn)
-        if table.note:
-            console.print(rich.text.Text(table.note))
     return captured.get().removesuffix("\n")
+
+
+def require_tensorboard() -> None:
+    """Raises `ConfigError` unless tensorboardX is installed."""
+    try:
+        importlib.import_module("tensorboardX")
+    except ImportError:
+        reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
+        raise ConfigError("tensorboard", True, reason) from None
+
+
+def tensorboard(path: Path) -> Callable[..., None]:
+    """Returns a function that writes reported metrics to event files in a directory of a run."""
+    from tensorboardX import SummaryWriter  # noqa: PLC0415 (an optional dependency)
+
+    writer = SummaryWriter(str(inside.place(path, path.parent)))
+
+    def write(*, stage: str, step: int, **metrics: float) -> None:
+        for name, value in metrics.items():
+            writer.add_scalar(f"{stage}/{name}", value, step)
+        writer.flush()
+
+    return write

@@ -9,8 +9,6 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
-SIZE = 340
-"""Side of a view, in px."""
 _SMOOTHING = 8  # frames in which a shape comes to its new form
 _TRANSFORMS = ("translate", "rotate")
 _UNITS = collections.defaultdict(lambda: "px", opacity="", rotate="deg")
@@ -19,17 +17,9 @@ _CLOSE = collections.defaultdict(lambda: 0.1, opacity=0.01, rotate=0.5)
 
 
 def add(parent: Element, tag: str, text: str | None = None, **attributes: ArrayLike) -> Element:
-    """Adds an element.
-
-    Args:
-      parent: of the element.
-      tag: of the element.
-      text: in the element.
-      **attributes: numbers or texts; `class_` is `class`, and `_` in other names is `-`.
-    """
-    names = (name.rstrip("_").replace("_", "-") for name in attributes)
-    values = (_text(value) for value in attributes.values())
-    element = ElementTree.SubElement(parent, tag, dict(zip(names, values, strict=True)))
+    """Adds an element; in names of attributes, `class_` is `class` and `_` elsewhere is `-`."""
+    given = {name.rstrip("_").replace("_", "-"): _text(x) for name, x in attributes.items()}
+    element = ElementTree.SubElement(parent, tag, given)
     element.text = text
     return element
 
@@ -67,16 +57,20 @@ class Timeline:
           jumps: whether it jumps from value to value.
         """
         rows = np.asarray(values, float).reshape(len(self.moments), -1)
-        if attribute in _TRANSFORMS:
-            element.set("transform", f"{attribute}({_list(rows[-1])})")
-        else:
-            element.set(attribute, _list(rows[-1]))
+        is_transform = attribute in _TRANSFORMS
+        last = " ".join(map(_text, rows[-1]))
+        element.set(
+            "transform" if is_transform else attribute,
+            f"{attribute}({last})" if is_transform else last,
+        )
         kept = _changes(rows) if jumps else _corners(self.moments, rows, _CLOSE[attribute])
         if (rows[kept] == rows[-1]).all():
             return
-        frames = "".join(f"{_percent(self.moments[i])}{_rule(attribute, rows[i])}" for i in kept)
-        if not jumps:
-            frames += f"100%{_rule(attribute, rows[-1])}"
+        ends = [] if jumps else [(1.0, rows[-1])]  # the last frame stays
+        frames = "".join(
+            f"{_text(100 * share)}%{_rule(attribute, row)}"
+            for share, row in [*zip(self.moments[kept], rows[kept], strict=True), *ends]
+        )
         # Named after what they hold, so that films can share a page.
         name = f"k{hashlib.blake2b(frames.encode(), digest_size=5).hexdigest()}"
         rule = f"@keyframes {name}{{{frames}}}\n"
@@ -86,19 +80,11 @@ class Timeline:
         play = f"{name} {'step-end' if jumps else 'linear'} var(--film)"
         element.set("style", f"{before},{play}" if before else f"animation:{play}")
 
-
-def strip(parent: Element, timeline: Timeline, texts: list[str], **attributes: ArrayLike) -> None:
-    """Draws a text that changes.
-
-    Args:
-      parent: of the elements.
-      timeline: when the frames are shown.
-      texts: `[F]` the text of each frame; none is drawn for an empty one.
-      **attributes: see `add`.
-    """
-    for text in filter(None, dict.fromkeys(texts)):
-        element = add(parent, "text", text, **attributes)
-        timeline.animate(element, "opacity", [float(t == text) for t in texts], jumps=True)
+    def strip(self, parent: Element, texts: list[str], **attributes: ArrayLike) -> None:
+        """Draws the `[F]` texts of the frames in one place; none for an empty one."""
+        for text in filter(None, dict.fromkeys(texts)):
+            element = add(parent, "text", text, **attributes)
+            self.animate(element, "opacity", [t == text for t in texts], jumps=True)
 
 
 def smooth(values: np.ndarray) -> np.ndarray:
@@ -110,20 +96,12 @@ def smooth(values: np.ndarray) -> np.ndarray:
     return windows.mean(axis=-1)
 
 
-def _list(row: np.ndarray, unit: str = "", between: str = " ") -> str:
-    return between.join(f"{_text(value)}{unit}" for value in row)
-
-
 def _rule(attribute: str, row: np.ndarray) -> str:
     """What an attribute is, in CSS."""
-    value = _list(row, _UNITS[attribute], ",")
+    value = ",".join(f"{_text(each)}{_UNITS[attribute]}" for each in row)
     if attribute in _TRANSFORMS:
         return f"{{transform:{attribute}({value})}}"
     return f"{{{attribute}:{value}}}"
-
-
-def _percent(share: float) -> str:
-    return f"{round(100 * float(share), 2):g}%"
 
 
 def _changes(rows: np.ndarray) -> list[int]:

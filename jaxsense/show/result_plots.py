@@ -1,0 +1,285 @@
+"""The plots of learning and of missions: looks, calibration, the paper's Fig. 5, policies."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import cast
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from jaxsense.config import Config
+from jaxsense.core.types import Reliability
+from jaxsense.show.colours import (
+    MARKERS,
+    SOFT,
+    as_srgb,
+    class_colour,
+    modality_colour,
+    policy_colour,
+    policy_marker,
+)
+from jaxsense.show.tables import counted
+from jaxsense.summary.blocks import AGENTS, MISSIONS, Agent, Beliefs, Case, Evaluation, Missions
+from jaxsense.summary.blocks import cases as cases_of
+from jaxsense.summary.blocks import policies as policies_of
+from jaxsense.summary.compare import bounds
+from jaxsense.summary.metrics import Number, mean
+
+Arrays = dict[str, np.ndarray]
+Curves = dict[str, Arrays]
+"""For each Q-network, named by its modality or `team`, `[epochs]` or `[K, epochs]` mean total
+rewards: `reward` of the exploring policy, and `evaluation` of the learned policy alone on the map,
+NaN where it was not played."""
+
+_COLUMNS = 4  # classes side by side
+_STRIP, _CURVE = 0.3, 1.5  # inches, of a look by a camera and of another one
+_SMOOTHING = 20  # epochs
+_MIN_LOOKS = 20  # in a bin of the calibration
+_REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
+_BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1), "frameon": False, "fontsize": 9}
+_ABOVE = {"loc": "lower left", "bbox_to_anchor": (0, 1), "frameon": False, "fontsize": 9}
+
+
+def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
+    """One look at each class as each detector reads it, from left to right.
+
+    Dashed lines mark the bearing of the PoI, where robots expect its centre. All distances have one
+    scale.
+
+    Args:
+      config: all settings.
+      windows: for each modality `[C, window, channels]` readings, from left to right.
+    """
+    classes = config.arena.classes
+    columns = min(len(classes), _COLUMNS)
+    sensors = [*windows] * math.ceil(len(classes) / columns)
+    heights = [_STRIP if windows[name].shape[-1] == 3 else _CURVE for name in sensors]
+    size = (3.0 * columns, sum(heights) + 0.2 * len(sensors) + 0.6)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
+    for i, (name, row) in enumerate(zip(sensors, axes, strict=True)):
+        first = i // len(windows) * columns
+        row[0].set_ylabel(name, rotation=0, ha="right", va="center")
+        for c, ax in enumerate(row, first):
+            if c >= len(classes):
+                ax.set_axis_off()
+                continue
+            if i % len(windows) == 0:
+                ax.set_title(classes[c], fontsize=10)
+            _draw_look(ax, windows[name], c, class_colour(config.arena, classes[c]))
+            ax.tick_params(labelleft=c == first)
+    words = "rays of the window, from left to right; distances in metres; dashed: the PoI's bearing"
+    figure.supxlabel(words, fontsize=10)
+    return figure
+
+
+def _draw_look(ax: Axes, readings: np.ndarray, c: int, colour: str) -> None:
+    """Draws the look at class c of `[C, window, channels]` readings."""
+    values = readings[c]
+    if readings.shape[-1] == 3:  # an image
+        ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="none")
+        ax.set_yticks([])
+    else:
+        top = 1.05 * np.max(readings, initial=0.0, where=np.isfinite(readings))
+        ax.plot(values, ".", color=colour, markersize=3)
+        ax.set_ylim(0, top or 1.0)
+        ax.grid(axis="y", alpha=0.3)
+    ax.set(xlim=(-0.5, len(values) - 0.5), xticks=[])
+    ax.axvline((len(values) - 1) / 2, color=SOFT, linestyle="--", linewidth=1)
+
+
+def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
+    """The paper's Fig. 5: reward of whole episodes over the epochs, with other policies as lines.
+
+    Robots alone on the map share an axis.
+
+    Args:
+      curves: of one run or of several seeds.
+      agents: the block `dqn` of the summary.
+    """
+    panels: list[tuple[str, Arrays, Agent | None]] = []
+    for name, of_network in curves.items():
+        if name in agents:
+            panels.append((f"{name}: a robot alone on the map", of_network, agents[name]))
+            continue
+        # Rewards of a team's episodes cannot be compared with those of a single robot on the map.
+        alone, agent = next(iter(agents.items()))
+        evaluation = {"evaluation": of_network["evaluation"]}
+        panels.append((f"episodes of the whole {name}", {"reward": of_network["reward"]}, None))
+        panels.append((f"{name}: one {alone} robot alone on the map", evaluation, agent))
+    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    bottom = min(_bottom(agent) for *_, agent in panels if agent is not None)
+    for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
+        for kind, values in of_panel.items():
+            _draw_rewards(ax, kind, np.atleast_2d(values))
+        for name, line in _REFERENCES.items():
+            if agent is not None and agent[name] is not None:
+                height = mean(agent[name])
+                label = AGENTS[name].label
+                label += f": {height:.2f}, below" if height < bottom else ""
+                ax.axhline(height, color=policy_colour(name), linestyle=line, label=label)
+        ax.set(title=title, xlabel="epoch", ylabel="total reward of an episode")
+        ax.grid(alpha=0.3)
+        ax.legend(**_BESIDE)
+    alone = [ax for ax, (*_, agent) in zip(axes, panels, strict=True) if agent is not None]
+    top = max(ax.get_ylim()[1] for ax in alone)
+    for ax in alone:
+        ax.set_ylim(bottom, top)
+    return figure
+
+
+def _bottom(agent: Agent) -> float:
+    """Where the axis of an agent begins; random policies are far below."""
+    naive = mean(agent["naive"])
+    optimal = naive if agent["optimal"] is None else mean(agent["optimal"])
+    return min(naive, mean(agent["return"])) - max(0.5, optimal - naive)
+
+
+def _draw_rewards(ax: Axes, kind: str, values: np.ndarray) -> None:
+    """Draws `[K, epochs]` rewards: the mean, and of several seeds its 95% interval."""
+    if len(values) == 0:
+        return
+    if kind == "evaluation":
+        epochs = np.flatnonzero(np.isfinite(values).any(axis=0))
+        shown, label, colour = values[:, epochs], "without exploration", policy_colour("latent")
+    else:
+        shown, label, colour = np.array([*map(_smoothed, values)]), "exploring", "#8c8c8c"
+        epochs = np.arange(values.shape[1] - shown.shape[1], values.shape[1])
+    ax.plot(epochs, shown.mean(axis=0), color=colour, label=label, linewidth=1.2)
+    if len(shown) > 1:
+        ax.fill_between(epochs, *bounds(shown), color=colour, alpha=0.2, linewidth=0)
+
+
+def _smoothed(reward: np.ndarray) -> np.ndarray:
+    """Running mean over the epochs in which an episode ended."""
+    window = np.ones(min(_SMOOTHING, len(reward)))
+    number = np.convolve(np.isfinite(reward), window, mode="valid")
+    total = np.convolve(np.nan_to_num(reward), window, mode="valid")
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
+def calibration(config: Config, reliability: Mapping[str, Reliability], belief: Beliefs) -> Figure:
+    """Whether probabilities are right: of the detectors, and of the map after several looks.
+
+    Args:
+      config: all settings.
+      reliability: for each modality the points of its diagram.
+      belief: the block `belief` of the summary.
+    """
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot([0, 1], [0, 1], ":", color=SOFT, label="calibrated")
+    for i, (name, found) in enumerate(reliability.items()):
+        is_shown = found.looks >= _MIN_LOOKS  # bins of few looks tell nothing
+        confidence, accuracy = found.confidence[is_shown], found.accuracy[is_shown]
+        share = found.looks[is_shown] / np.sum(found.looks)
+        style = {"color": modality_colour(i), "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
+        left.plot(confidence, accuracy, label=name, markerfacecolor="none", linewidth=1, **style)
+        # Hollow, for most lie on top of each other where detectors are confident.
+        hollow = {"facecolors": "none", "edgecolors": modality_colour(i)}
+        left.scatter(confidence, accuracy, 10 + 300 * share, **hollow)
+    lowest = 1 / max(len(config.labels(name)) for name in reliability)
+    left.set(xlabel="confidence of a detector", ylabel="share of right labels")
+    left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
+    right.plot(belief["looks"], belief["nll"], "o-", color=policy_colour("latent"), label="map")
+    style = {"color": policy_colour("bayes"), "markersize": 9, "markerfacecolor": "none"}
+    right.plot(belief["looks"], belief["bayes_nll"], "s--", label="exact Bayes", **style)
+    right.set(xlabel="looks", ylabel="NLL of the true class [nats]", yscale="log")
+    right.set_xticks(belief["looks"])
+    right.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    right.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    right.yaxis.set_minor_formatter(NullFormatter())
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+        ax.legend(ncols=3, **_ABOVE)
+    return figure
+
+
+def policies(block: Missions, num_pois: int) -> Figure:
+    """Looks and time of every policy, the slowest last, with 95% intervals, and its wrong PoIs.
+
+    The intervals are of the paired differences from the latent policy; with several seeds, of the
+    means.
+
+    Args:
+      block: `mission` of the summary.
+      num_pois: points of interest of a mission.
+    """
+    played = policies_of(block)
+    names = sorted(played, key=lambda name: -mean(played[name]["mean_time_s"]))
+    figure = Figure(figsize=(10, 1.2 + 0.35 * len(names)), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    keys = ("observations_per_poi", "observations_per_poi"), ("mean_time_s", "time_s")
+    for ax, (key, difference) in zip(axes, keys, strict=True):
+        for y, name in enumerate(names):
+            case = cast(dict[str, Number], played[name])
+            error = _error(case[key], cast(dict, case.get("intervals", {})).get(difference))
+            style = {"fmt": policy_marker(name), "color": policy_colour(name), "capsize": 3}
+            ax.errorbar(mean(case[key]), y, xerr=error, **style)
+        ax.set(xlabel=MISSIONS[key].label, ylim=(-0.7, len(names) - 0.3))
+        ax.set_xlim(0, 1.05 * ax.dataLim.x1)
+        ax.grid(axis="x", alpha=0.3)
+    axes[0].set_yticks(range(len(names)), names)
+    for y, name in enumerate(names):
+        if name == "latent":
+            axes[0].get_yticklabels()[y].set(color=policy_colour(name), weight="bold")
+        wrong = _wrong(played[name], num_pois)
+        place = axes[1].get_yaxis_transform()
+        axes[1].text(1.02, y, wrong, transform=place, va="center", color=SOFT)
+    return figure
+
+
+def _wrong(case: Case, num_pois: int) -> str:
+    """The share of wrong PoIs, and of one seed their number."""
+    share = 1 - mean(case["accuracy"])
+    text = f"{100 * share:.1f} % of PoIs wrong"
+    if isinstance(case["accuracy"], dict):
+        return text
+    number = round(mean(case["episodes"]) * num_pois)
+    return f"{text} ({round(share * number):,} of {number:,})"
+
+
+def _error(value: Number, difference: Number | None) -> list[list[float]] | None:
+    """Ends of a bar, from the interval of a value or else of its difference."""
+    found = value if isinstance(value, dict) else difference
+    match found:
+        case {"mean": float(middle), "low": float(low), "high": float(high)}:
+            return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
+    return None
+
+
+def places(evaluations: Iterable[Evaluation]) -> Figure:
+    """Median time of missions of every policy, a row for each arena and team.
+
+    Args:
+      evaluations: missions; of the same arena and team, those with the most are shown.
+    """
+
+    def size(place: Evaluation) -> float:
+        return max(mean(case["episodes"]) for case in cases_of(place["mission"]).values())
+
+    largest = {_place(each): each for each in sorted(evaluations, key=size)}
+    names = sorted(largest, key=lambda name: (largest[name]["num_pois"], largest[name]["robots"]))
+    figure = Figure(figsize=(10, 1.6 + 0.4 * len(names)), layout="constrained")
+    ax = figure.subplots()
+    played = {name: policies_of(largest[name]["mission"]) for name in names}
+    for policy in dict.fromkeys(policy for each in played.values() for policy in each):
+        rows = [y for y, name in enumerate(names) if policy in played[name]]
+        times = [mean(played[names[y]][policy]["time_s"]) for y in rows]
+        marker, colour = policy_marker(policy), policy_colour(policy)
+        ax.plot(times, rows, marker, color=colour, label=policy, markerfacecolor="none")
+    ax.set_yticks(range(len(names)), names)
+    ax.set(xlabel=MISSIONS["time_s"].label, xscale="log", ylim=(-0.7, len(names) - 0.3))
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.grid(alpha=0.3)
+    ax.legend(**_BESIDE)
+    return figure
+
+
+def _place(found: Evaluation) -> str:
+    return f"{found['num_pois']} PoIs in {found['side']:g} m: {counted(found['robots'])}"
