@@ -200,9 +200,8 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     (page,) = played.glob("runs/*/*")
     assert re.fullmatch(r"runs/\d{8}-\d{6}-demo-default/demo\.html", str(page.relative_to(played)))
     text = page.read_text()
-    # Both halves of each film, side by side.
-    (films,) = re.findall('<div class="halves pair">.*</svg>', text, re.DOTALL)
-    assert films.count("<svg") == 2 * 2
+    (films,) = re.findall('<figure class="films">.*</svg>', text, re.DOTALL)
+    assert films.count('<svg class="film"') == 2
     assert "latent policy" in films
     assert "naive policy" in films
     assert "python -m jaxsense.demo --preset default --seed 3" in text
@@ -223,7 +222,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
 def test_the_demo_compares_any_policy_with_naive_exploration(played, policy, films):
     demo.main([*NO_CACHE, "--policy", policy, "--out", "here", "--seed", "7"])
     text = (played / "here" / "demo.html").read_text()
-    assert text.count("<svg") == 2 * films
+    assert text.count('<svg class="film"') == films
     assert f'<th scope="row">{policy}</th>' in text
     assert "--seed 8" in text
 

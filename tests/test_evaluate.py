@@ -29,7 +29,7 @@ from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.show import animation
+from jaxsense.show import film
 
 
 @pytest.fixture(scope="module")
@@ -68,14 +68,14 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
         assert ("intervals" in blocks[policy]) == (policy != "latent")
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (1, 0)
     plot = ElementTree.parse(path / "evaluations" / f"{NAME}.svg")
-    assert "of 3 PoIs wrong" in "".join(plot.getroot().itertext())
+    assert "PoIs wrong" in "".join(plot.getroot().itertext())
 
 
 def write(arguments, missions):
     config, models = jaxsense.load(arguments.run)
     played = recording()
     draw = functools.partial(
-        animation.draw, config, played.records, played.end, models.fusion, FIELDS_OF_VIEW
+        film.draw, config, played.records, played.end, models.fusion, FIELDS_OF_VIEW
     )
     return evaluate._write(arguments, config, config, missions, draw)
 
@@ -134,7 +134,7 @@ def test_evaluations_by_others_stand_apart(evaluated, tmp_path, other):
 def test_a_plot_of_teams_compares_figures_of_one_origin(evaluated, tmp_path, monkeypatch):
     path, drawn = tmp_path / "run", []
     shutil.copytree(evaluated[0], path)
-    monkeypatch.setattr(evaluate.mission_plots, "teams", drawn.append)
+    monkeypatch.setattr(evaluate.result_plots, "places", drawn.append)
     monkeypatch.setattr(evaluate.drawing, "svg", lambda plot: b"")
     here = read(path)
     own = {"origin": here["origin"], "other": {**here["origin"], "commit": "other"}}
@@ -293,10 +293,12 @@ def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
     # Of both evaluations.
     assert set(found["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
     assert {"told", "ambiguous_reported"} <= set(found["mission"]["camera_2_alone"])
-    film = ElementTree.parse(path / "mission-nearest-0-3-points-3-m-2-camera-1-lidar.svg")
-    lines = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    drawn = ElementTree.parse(path / "mission-nearest-0-3-points-3-m-2-camera-1-lidar.svg")
+    lines = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert {"camera 1: choosing", "camera 2: choosing", "lidar: choosing"} <= lines
-    assert "robots" in "".join(ElementTree.parse(path / "teams.svg").getroot().itertext())
+    assert "2 camera, 1 lidar" in "".join(
+        ElementTree.parse(path / "teams.svg").getroot().itertext()
+    )
     assert "2 camera, 1 lidar" in (path / "report.html").read_text(encoding="utf-8")
 
 
@@ -306,7 +308,7 @@ def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run
     for report, episodes, groups, policies in ((smoke_run, 4, 1, 1), (path, 1, 2, 2)):
         text = (report / "report.html").read_text()
         assert text.count("image/svg+xml") == 4 + policies
-        assert text.count('<div class="halves') == groups
+        assert text.count('<figure class="films') == groups
         assert f"{episodes} missions of each policy" in text
 
 
@@ -327,8 +329,8 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
     seconds = recording.end.steps * config.mission.control_period
     assert found["time_s"][0] == pytest.approx(seconds)
-    film = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
-    texts = {text.text for text in film.iter("{http://www.w3.org/2000/svg}text")}
+    drawn = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
+    texts = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert {f"{seconds:.1f} s", "latent policy, seed 0"} <= texts
 
 

@@ -25,7 +25,7 @@ from jaxsense.run import seeds
 from jaxsense.run.checkpoints import Unfinished
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.show import tensorboard
+from jaxsense.show import terminal
 from jaxsense.summary import statistics
 
 FEWER = SUMMARY["jmvae"] | {"unambiguous": {"joint": [True]}}
@@ -315,7 +315,7 @@ def test_other_directories_of_a_run_stay_in_it(tmp_path, name):
         opens = (
             (lambda: seeds.paths(run))
             if name == "seed-1"
-            else (lambda: tensorboard.make_writer(run.path / name))
+            else (lambda: terminal.tensorboard(run.path / name))
         )
         with pytest.raises(OSError, match="Leads out of its directory"):
             opens()

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from smoke import MISSION_KEYS, SMOKE, error_line
 from untrained import untrained
 
@@ -20,7 +21,7 @@ from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.show import report
+from jaxsense.show import drawing
 
 
 def test_run_directory_holds_everything(smoke_run):
@@ -125,21 +126,21 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
     config, drawn = dataclasses.replace(PRESETS["smoke"], mission=first), []
     draw = lambda *inputs: drawn.append(inputs[-2:]) or ""  # noqa: E731
-    monkeypatch.setattr(report.animation, "draw", draw)
-    monkeypatch.setattr(report.plots, "of_missions", lambda missions, num_pois: {})
+    monkeypatch.setattr(drawing.film, "draw", draw)
+    monkeypatch.setattr(drawing.result_plots, "policies", lambda missions, num_pois: Figure())
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
 
     def recording(steps):
         return SimpleNamespace(records=None, end=SimpleNamespace(steps=steps))
 
     played = SimpleNamespace(recording=recording(50), missions={}, naive=None)
-    found = report.of_missions(config, learned, played)  # pyright: ignore
-    assert [*found] == ["mission.svg"]
+    found = drawing.of_missions(config, learned, played)  # pyright: ignore
+    assert [*found] == ["policies.svg", "mission.svg"]
     assert drawn == [("naive_2 policy", pytest.approx(5.0))]
     # With the film of naive exploration, both last as long as the longer one.
     played = SimpleNamespace(recording=recording(50), missions={}, naive=recording(80))
-    found = report.of_missions(config, learned, played)  # pyright: ignore
-    assert [*found] == ["mission.svg", "mission-naive.svg"]
+    found = drawing.of_missions(config, learned, played)  # pyright: ignore
+    assert [*found] == ["policies.svg", "mission.svg", "mission-naive.svg"]
     assert drawn[1:] == [("naive_2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]
 
 

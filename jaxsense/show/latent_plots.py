@@ -37,7 +37,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     names, classes = ["joint", *config.modalities], config.arena.classes
     titles = {"joint": " & ".join(config.modalities)}
     rows = _ROW * len(classes) + 0.2
-    figure = Figure(figsize=(3.6 * len(names) + 1.2, 4.6 + rows), layout="constrained")
+    figure = Figure(figsize=(3.6 * len(names) + 1.2, 4.6 + rows), layout="compressed")
     above, below = figure.subplots(
         2, len(names), squeeze=False, sharex="row", sharey="row", height_ratios=(3.6, rows)
     )

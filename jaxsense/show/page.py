@@ -109,8 +109,8 @@ def drawing(film: str) -> Markup:
 
 def _copied(element: Element) -> Element:
     """A copy of what films are made of, without the namespace, which HTML knows."""
-    given = element.attrib.items()
-    kept = {name: x for name, x in given if _ATTRIBUTE(name) and (name != "style" or _STYLE(x))}
+    given = {name: x for name, x in element.attrib.items() if _ATTRIBUTE(name) and "url(" not in x}
+    kept = {name: x for name, x in given.items() if name != "style" or _STYLE(x)}
     copy = Element(element.tag.removeprefix(_SVG), kept)
     is_sheet = copy.tag == "style"
     copy.text = "".join(_KEY_FRAMES.findall(element.text or "")) if is_sheet else element.text

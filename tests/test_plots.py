@@ -1,0 +1,332 @@
+"""The plots of a run say what is in them, in colours that all can tell apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.core.types import Belief
+from jaxsense.dqn import POLICIES
+from jaxsense.show import colours, drawing, latent_plots, result_plots
+from jaxsense.sim import sensors
+from jaxsense.training.measures import reliability
+
+CONFIG = PRESETS["smoke"]
+LIDAR = replace(
+    CONFIG, modalities=("lidar",), jmvae=replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
+)
+CURVES = {"reward": np.arange(40.0), "evaluation": np.full(40, np.nan)}
+CURVES["evaluation"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
+AGENT = {"return": 4.0, "optimal": 4.5, "naive": 3.0, "random": -1.0}
+FOUR_SHAPES = {**SHAPES, "post": Shape("cylinder", (0.5, 0.5)), "slab": Shape("box", (1.0, 0.5))}
+
+
+def lines(axes):
+    return {line.get_label(): line for line in axes.lines}
+
+
+def test_files_keep_their_words_repeat_and_are_dark_on_dark_pages():
+    def content():
+        figure = Figure(figsize=(4, 3), layout="constrained")
+        figure.subplots().text(0.1, 0.5, "some words")
+        return drawing.svg(figure)
+
+    text = content().decode()
+    assert text.startswith("<?xml")
+    assert ">some words</text>" in text
+    assert text.index("<svg") < text.index("(prefers-color-scheme:dark){svg,image{filter:invert(")
+    assert content().decode() == text
+
+
+def test_the_evaluation_is_drawn_where_it_was_played():
+    (axes,) = result_plots.rewards({"camera": CURVES}, {"camera": AGENT}).axes
+    drawn = lines(axes)
+    np.testing.assert_array_equal(drawn["without exploration"].get_xdata(), [9, 19, 29, 39])
+    np.testing.assert_array_equal(drawn["without exploration"].get_ydata(), [1, 2, 3, 4])
+    # The mean of the last 20 epochs, from 20 to 39.
+    assert drawn["exploring"].get_ydata()[-1] == 29.5
+    assert drawn["optimal"].get_ydata()[0] == 4.5
+    # The axis begins as far below naive exploration as the optimum is above; a text has the rest.
+    assert axes.get_ylim()[0] == 1.5
+    names = {text.get_text() for text in axes.get_legend().get_texts()}
+    assert names == {*drawn} == {
+        "exploring", "without exploration", "optimal", "naive", "random: -1.00, below"
+    }  # fmt: skip
+    # A bad policy is shown too, .5 below it. Robots alone on the map share an axis.
+    bad = {"return": -2.0, "optimal": 3.0, "naive": 3.0, "random": -1.0}
+    both = {"camera": CURVES, "lidar": CURVES}
+    one, other = result_plots.rewards(both, {"camera": AGENT, "lidar": bad}).axes
+    assert one.get_ylim() == other.get_ylim()
+    assert one.get_ylim()[0] == -2.5
+    assert "random" in lines(other)
+
+
+def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():
+    figure = result_plots.rewards(
+        {"team": CURVES}, {"camera": AGENT, "lidar": {**AGENT, "optimal": 9.0}}
+    )
+    of_team, alone = map(lines, figure.axes)
+    assert set(of_team) == {"exploring"}
+    assert set(alone) == {"without exploration", "optimal", "naive", "random: -1.00, below"}
+    assert figure.axes[1].get_title() == "team: one camera robot alone on the map"
+    assert alone["optimal"].get_ydata()[0] == 4.5
+
+
+def test_curves_of_several_seeds_have_a_band():
+    two = {kind: np.stack([values, values + 2]) for kind, values in CURVES.items()}
+    (axes,) = result_plots.rewards({"camera": two}, {"camera": AGENT}).axes
+    np.testing.assert_array_equal(lines(axes)["without exploration"].get_ydata(), [2, 3, 4, 5])
+    assert len(axes.collections) == 2
+    nothing = {kind: np.zeros((0, 40)) for kind in CURVES}
+    result_plots.rewards({"camera": nothing}, {"camera": AGENT}).draw_without_rendering()
+
+
+def case(accuracy, looks, seconds, **more):
+    of_case = {"accuracy": accuracy, "observations_per_poi": looks, "mean_time_s": seconds}
+    return {**of_case, "episodes": 128, **more}
+
+
+def test_policies_stand_in_rows_by_their_time():
+    slower = {"mean": 15.0, "low": 12.0, "high": 18.0}
+    more = {"mean": 3.5, "low": 3.0, "high": 4.0}
+    block = {
+        "latent": case(0.98, 2.5, 40.0),
+        "naive_3": case(1.0, 6.0, 55.0, intervals={"observations_per_poi": more, "time_s": slower}),
+        "random": case(0.5, 1.0, 20.0),
+        "camera_alone": case(0.5, 1.0, 20.0),
+        "bytes_per_detection": {"latent": 16, "raw": 2000},
+    }
+    by_looks, by_time = result_plots.policies(block, 3).axes
+    names = [label.get_text() for label in by_looks.get_yticklabels()]
+    assert names == ["naive_3", "latent", "random"]  # upwards
+    # Of 3 PoIs in 128 missions.
+    assert [text.get_text() for text in by_time.texts] == [
+        "0.0 % of PoIs wrong (0 of 384)",
+        "2.0 % of PoIs wrong (8 of 384)",
+        "50.0 % of PoIs wrong (192 of 384)",
+    ]
+    assert by_looks.lines[0].get_xdata() == [6.0]
+    # A bar for the difference of naive exploration from the latent policy, around its own value.
+    (bar,) = by_time.collections
+    ((low, high),) = bar.get_segments()
+    assert (low.tolist(), high.tolist()) == ([52.0, 0.0], [58.0, 0.0])
+
+
+def test_of_several_seeds_the_bars_are_those_of_the_means():
+    value = {"mean": 2.0, "low": 1.5, "high": 2.5}
+    accuracy = {"mean": 0.98, "low": None, "high": None}
+    ax, by_time = result_plots.policies({"latent": case(accuracy, value, value)}, 3).axes
+    ((low, high),) = ax.collections[0].get_segments()
+    assert (low[0], high[0]) == (1.5, 2.5)
+    assert by_time.texts[0].get_text() == "2.0 % of PoIs wrong"
+
+
+def test_every_arena_and_team_has_a_row_of_times():
+    def place(number, robots, seconds, side=3.0, episodes=8, **more):
+        times = {"latent": seconds, "naive": seconds + 1, **more}
+        mission = {n: {"time_s": time, "episodes": episodes} for n, time in times.items()}
+        return {"num_pois": number, "side": side, "robots": robots.split(), "mission": mission}
+
+    found = [
+        place(16, "camera camera lidar lidar", 45.0, auction=40.0),
+        place(3, "camera lidar", 12.0),
+        place(8, "lidar lidar lidar", 99.0, side=9.0, episodes=7),  # fewer missions
+        place(8, "lidar lidar lidar", 50.0, side=9.0),
+    ]
+    (axes,) = result_plots.places(found).axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == [
+        "3 PoIs in 3 m: 1 camera, 1 lidar",
+        "8 PoIs in 9 m: 3 lidar",
+        "16 PoIs in 3 m: 2 camera, 2 lidar",
+    ]
+    drawn = {name: np.transpose(line.get_data()).tolist() for name, line in lines(axes).items()}
+    assert drawn["latent"] == [[12, 0], [50, 1], [45, 2]]
+    assert drawn["auction"] == [[40, 2]]
+
+
+def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
+    # Of ten looks at a class, nine say so with .9, and one says the opposite. A bin of fewer than
+    # twenty looks, six with .8, is left out.
+    right, wrong, rare = [0.9, 0.1], [0.1, 0.9], [0.8, 0.2]
+    looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
+    looks = np.concatenate([looks, np.tile(rare, (3, 2, 1))], axis=1)
+    belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
+    figure = result_plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief)
+    detectors, beliefs = map(lines, figure.axes)
+    points = np.array(detectors["lidar"].get_data())
+    np.testing.assert_allclose(points[np.isfinite(points)], [0.9, 0.9], rtol=1e-6)
+    np.testing.assert_array_equal(beliefs["map"].get_ydata(), [0.5, 0.2])
+    np.testing.assert_array_equal(beliefs["exact Bayes"].get_ydata(), [0.4, 0.1])
+
+
+def test_camera_and_lidar_are_drawn_from_left_to_right():
+    # Camera and LiDAR see 0.4 of full scale, on the left 0.8.
+    windows = {}
+    for sensor in sensors.make(CONFIG):
+        is_left = sensor.angles[:: sensor.stride][: sensor.window]
+        readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
+        readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, -1)
+        windows[sensor.name] = sensor.from_left(np.repeat(readings, 3, axis=0))
+    axes = np.reshape(result_plots.scanlines(CONFIG, windows).axes[:6], (2, 3))
+    # Names once for each row and each column.
+    titles = [[ax.get_title() for ax in row] for row in axes]
+    assert titles == [[*CONFIG.arena.classes], [""] * 3]
+    assert [[ax.get_ylabel() for ax in row] for row in axes] == [
+        ["camera", "", ""],
+        ["lidar", "", ""],
+    ]
+    # The PoI is expected in the middle.
+    for ax, number in zip(axes[:, 0], (CONFIG.camera.window, CONFIG.lidar.window), strict=True):
+        assert ax.lines[-1].get_xdata()[0] == (number - 1) / 2
+    # 1.055 * 0.8^(1 / 2.4) - 0.055 = 0.9063 and 1.055 * 0.4^(1 / 2.4) - 0.055 = 0.6652
+    pixels = np.asarray(axes[0, 0].images[0].get_array()[0])
+    np.testing.assert_allclose(pixels[[0, -1]], [[0.9063] * 3, [0.6652] * 3], atol=1e-4)
+    # Near black it is linear: 12.92 * 0.002 = 0.02584.
+    np.testing.assert_allclose(colours.as_srgb(np.array([0.0, 0.002, 1.0])), [0, 0.02584, 1])
+    ranges = axes[1, 0].lines[0].get_ydata()
+    assert ranges[0] > ranges[-1]
+    # All distances on one scale.
+    for ax in axes[1]:
+        assert ax.get_ylim() == (0.0, pytest.approx(1.05 * 0.8))
+
+
+CENTRES = np.array([[2.0, 0.0], [-2.0, 0.0], [-2.0, 0.05]])  # the last two look alike
+
+
+def posteriors():
+    noise = 0.01 * np.random.default_rng(0).normal(size=(3, 10, 2))
+    belief = Belief(CENTRES[:, None] + noise, np.full((3, 10, 2), 0.5))
+    return dict.fromkeys(("joint", "camera", "lidar"), belief)
+
+
+def test_classes_are_named_above_their_ellipses_and_seen_where_they_look_alike():
+    figure = latent_plots.latent_space(CONFIG, posteriors())
+    figure.draw_without_rendering()
+    axes, below = figure.axes[0], figure.axes[3]
+    names = {text.get_text(): text for text in axes.texts}
+    assert set(names) == {"green cylinder", "red cylinder\nred cube"}
+    for text in names.values():
+        box = text.get_window_extent().transformed(axes.transData.inverted())
+        assert box.y0 > 0.5  # half an ellipse's height above the centre
+        assert box.y1 < axes.get_ylim()[1]
+    ellipses = [c for c in axes.collections if isinstance(c, PatchCollection)]
+    (green,), (red,), (cube,) = (each.get_linestyle() for each in ellipses)
+    assert green[1] is None  # solid, for it is alone
+    # Each draws where the other leaves gaps, of one length.
+    assert red[1][0] == red[1][1] == cube[1][0] == cube[1][1]
+    assert cube[0] - red[0] == red[1][0]
+    assert [label.get_text() for label in below.get_yticklabels()] == [*CONFIG.arena.classes]
+    for c, points in enumerate(each.get_offsets() for each in below.collections):
+        np.testing.assert_allclose(points[:, 0], np.sqrt(0.5))
+        assert np.abs(points[:, 1] - c).max() < 0.5
+
+
+def test_a_latent_space_of_one_dimension_is_drawn():
+    flat = {n: Belief(b.mean[..., :1], b.std[..., :1]) for n, b in posteriors().items()}
+    latent_plots.latent_space(CONFIG, flat).draw_without_rendering()
+
+
+def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
+    paints = {"red": (0.8, 0.1, 0.1), "green": (0.1, 0.7, 0.1), "blue": (0.1, 0.1, 0.8)}
+    paints["grey"] = (0.5, 0.5, 0.5)
+    classes = tuple(f"{colour} {shape}" for colour in paints for shape in FOUR_SHAPES)
+    arena = ArenaConfig(shapes=FOUR_SHAPES, colours=paints, classes=classes)
+    config = replace(CONFIG, arena=arena, jmvae=replace(CONFIG.jmvae, latent_size=8))
+    sizes = {sensor.name: (16, sensor.window, sensor.channels) for sensor in sensors.make(config)}
+    windows = {name: np.full(size, 0.5) for name, size in sizes.items()}
+    # The fourth dimension shows the colour and the seventh the shape; a sensor knows one of them.
+    noise = 0.01 * np.random.default_rng(0).normal(size=(16, 9, 8))
+    colour, shape = np.zeros((16, 1, 8)), np.zeros((16, 1, 8))
+    colour[:, 0, 3], shape[:, 0, 6] = np.arange(16) // 4, np.arange(16) % 4
+    means = {"joint": colour + shape, "camera": colour, "lidar": shape}
+    of_all = {n: Belief(mean + noise, np.full((16, 9, 8), 0.3)) for n, mean in means.items()}
+    first = result_plots.scanlines(config, windows)
+    for figure in (first, latent_plots.latent_space(config, of_all)):
+        figure.draw_without_rendering()
+        width, height = figure.get_size_inches()
+        assert width < 16
+        for ax in figure.axes:
+            box = ax.get_position()
+            assert box.width * width > 2.0
+            assert box.height * height > (0.2 if figure is first else 2.0)
+    names = [{text.get_text() for text in ax.texts} for ax in figure.axes[:3]]
+    assert names == [set(classes), set(paints), set(FOUR_SHAPES)]
+    assert [ax.get_xlabel() for ax in figure.axes[:3]] == ["latent dimension 4"] * 3
+    assert figure.axes[0].get_ylabel() == "latent dimension 7"
+    assert not recwarn.list
+
+
+ARENAS = {
+    "four alike": ArenaConfig(
+        shapes=FOUR_SHAPES, classes=("red post", "red slab", "red cube", "red cylinder")
+    ),
+    "two attributes": ArenaConfig(
+        attributes={
+            "temperature": Attribute({"cold": 30.0, "hot": 60.0}),
+            "gloss": Attribute({"dull": 0.0, "shiny": 1.0}),
+        },
+        classes=tuple(
+            f"{colour} {shape} {temperature} {gloss}"
+            for colour in ("red", "green")
+            for shape in ("cylinder", "cube")
+            for temperature in ("cold", "hot")
+            for gloss in ("dull", "shiny")
+        ),
+    ),
+    "two names of black": ArenaConfig(
+        colours={"black": (0.0, 0.0, 0.0), "jet": (0.001, 0.0, 0.0), "white": (1.0, 1.0, 1.0)},
+        classes=("black cube", "jet cube", "black cylinder", "white cube", "white cylinder"),
+    ),
+}
+
+
+@pytest.mark.parametrize("arena", ARENAS.values(), ids=ARENAS)
+def test_every_class_has_a_colour_of_its_own(arena):
+    rgb = np.array([to_rgb(colours.class_colour(arena, label)) for label in arena.classes])
+    apart = np.linalg.norm(rgb[:, None] - rgb[None], axis=-1)[np.triu_indices(len(rgb), 1)]
+    assert apart.min() > 0.04  # 10 of 255
+
+
+def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
+    # (.1, .7, .1), (.8, .1, .1) and half of the latter.
+    found = [colours.class_colour(CONFIG.arena, label) for label in CONFIG.arena.classes]
+    assert found == ["#1ab21a", "#cc1a1a", "#660d0d"]
+
+
+# Linear RGB as those see it who lack one kind of cones (Machado et al. 2009).
+SIGHTS = {
+    "all cones": np.eye(3),
+    "no red": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
+    "no green": [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9690]],
+}
+
+
+def lab(colour, sight):
+    """CIE L*a*b* of a colour, as it is seen."""
+    rgb = np.array(to_rgb(colour))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = np.clip(np.array(sight) @ linear, 0, 1)
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    x, y, z = np.cbrt(np.array(to_xyz) @ seen / [0.9505, 1.0, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+@pytest.mark.parametrize("sight", SIGHTS.values(), ids=SIGHTS)
+def test_a_policy_has_one_colour_and_marker_that_all_can_tell_apart(sight):
+    names = [*POLICIES, "my own"]
+    assert len({colours.policy_marker(name) for name in names}) == len(names)
+    seen = [lab(colours.policy_colour(name), sight) for name in names]
+    apart = np.linalg.norm(np.subtract.outer(seen, seen).diagonal(axis1=1, axis2=3), axis=-1)
+    # Some five times what can be noticed.
+    assert apart[np.triu_indices(len(seen), 1)].min() > 13
+
+
+def test_curves_that_belong_to_no_policy_differ_as_policies_do():
+    styles = [colours.series(number) for number in range(len(POLICIES))]
+    for part in ("color", "marker"):
+        assert len({style[part] for style in styles}) == len(styles)
+    assert colours.series(len(POLICIES)) == styles[0]
