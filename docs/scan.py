@@ -37,7 +37,7 @@ def draw() -> Figure:
         else:
             ax.plot(angles, readings, ".", markersize=2, color=SOFT)
             ax.set(ylabel="distance [m]", ylim=(0, 1.05 * readings.max()))
-        seen = np.degrees(windows.window_of(sensor, sensor.angles, bearing))
+        seen = np.degrees(windows.around(sensor, sensor.angles, bearing))
         colour = modality_colour(modality)
         ax.axvspan(seen.min(), seen.max(), facecolor="none", edgecolor=colour, linewidth=2)
         ax.axvline(np.degrees(bearing), color=colour, linestyle="--")

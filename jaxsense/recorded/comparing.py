@@ -234,7 +234,7 @@ def nearest(
     other, *_ = many = simulated(jax.random.split(key, NUM_SIMULATED + 1), classes)
     # The rays that hit a PoI of any shape, wherever within the error of its bearing it is.
     half_width = jnp.arcsin(jnp.minimum(arena.poi_half_width / distance, 1.0))
-    off = jnp.abs(windows.window_of(sensor, sensor.angles, bearing) - bearing)
+    off = jnp.abs(windows.around(sensor, sensor.angles, bearing) - bearing)
     limit = jnp.maximum(half_width - jnp.radians(world.viewpoint.bearing_error), off.min())
     is_at_poi = jnp.repeat(off <= limit, sensor.channels)
 

@@ -62,59 +62,54 @@ def read(config: Config, file: Path | str) -> RecordedLooks:
     except Exception:  # whatever the content makes zipfile, zlib and NumPy raise
         expected = "is not a whole file of NumPy's format .npz, or holds objects, not numbers"
         raise ValueError(f"{file} {expected}") from None
-    made = sensors.make(config)
-    known = {"places"} | {f"{s.name}_{part}" for s in made for part in ("poses", "scans", "angles")}
+    of_sensors = {sensor.name: sensor for sensor in sensors.make(config)}
     for name in found:
-        if name not in known and name.endswith(("_poses", "_scans", "_angles")):
-            expected = f"must be {' or '.join(sensor.name for sensor in made)}"
+        sensor, _, part = name.rpartition("_")
+        if part in ("poses", "scans", "angles") and sensor not in of_sensors:
+            expected = f"must be {' or '.join(of_sensors)}"
             raise ValueError(f"{name} is of an unknown sensor; {expected}")
-    some = [s for s in made if {f"{s.name}_poses", f"{s.name}_scans"} & {*found}] or made
-    for name in ("places", *(f"{s.name}_{part}" for s in some for part in ("poses", "scans"))):
-        if name not in found:
-            raise ValueError(f"{name} is missing; a recording holds {', '.join(sorted(known))}")
-    _require_shape(found, "places", ("C", 2))
-    scans = {sensor.name: _scans(found, sensor) for sensor in some}
-    poses = {sensor.name: found[f"{sensor.name}_poses"] for sensor in some}
-    return RecordedLooks(found["places"], poses, scans)
+    some = [n for n in of_sensors if {f"{n}_poses", f"{n}_scans"} & {*found}] or [*of_sensors]
+    places = _array(found, "places", (np.size(found.get("places", ())) // 2, 2))
+    poses = {name: _array(found, f"{name}_poses", (len(places), 3)) for name in some}
+    scans = {name: _scans(found, of_sensors[name], len(places)) for name in some}
+    return RecordedLooks(places, poses, scans)
 
 
-def _scans(found: Mapping[str, np.ndarray], sensor: Sensor) -> np.ndarray:
+def _scans(found: Mapping[str, np.ndarray], sensor: Sensor, number: int) -> np.ndarray:
     """Checked scans of one sensor, along its own rays and without the gaps of lost beams."""
-    _require_shape(found, f"{sensor.name}_poses", ("C", 3))
-    name, angles = f"{sensor.name}_scans", f"{sensor.name}_angles"
-    if sensor.channels == 3 and found[name].dtype.kind in "iu":
-        expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
-        raise ValueError(f"{name} holds whole numbers ({found[name].dtype}); must be {expected}")
-    rays, others = sensor.angles, f"; of other rays, {angles} must hold the angles, in radians"
-    if angles in found:
-        _require_shape(found, angles, ("A",))
-        rays, others = found[angles], ""
+    name, rays = f"{sensor.name}_scans", sensor.angles
+    other = f"{sensor.name}_angles"
+    if is_other := other in found:
+        rays = _array(found, other, (found[other].size,))
         resampling.require_angles(f"angles of {sensor.name}", rays)
-    _require_shape(found, name, ("C", len(rays), *sensor.shape[1:]), others)
-    scans = found[name]
-    is_valid = np.asarray(sensor.is_valid(jnp.asarray(scans, jnp.float32))) | np.isnan(scans)
-    if not is_valid.all():
+    advice = "" if is_other else f"; of other rays, {other} must hold the angles, in radians"
+    scans = _array(found, name, (number, len(rays), *sensor.shape[1:]), advice)
+    if sensor.channels == 3 and scans.dtype.kind in "iu":
+        expected = "linear RGB from 0 to 1: divide bytes by 255 and undo their gamma"
+        raise ValueError(f"{name} holds whole numbers ({scans.dtype}); must be {expected}")
+    wrong = scans[~(np.asarray(sensor.is_valid(jnp.asarray(scans))) | np.isnan(scans))]
+    if wrong.size:
         returns = ", infinite or 0 without a return" if sensor.measures_distance else ""
         most = " and at most 1, linear RGB" if sensor.channels == 3 else ""
-        raise ValueError(f"{name} holds {scans[~is_valid][0]:g}; must be at least 0{returns}{most}")
+        raise ValueError(f"{name} holds {wrong[0]:g}; must be at least 0{returns}{most}")
     if sensor.measures_distance:
         closed = [resampling.close_gaps(rays, scan, step=sensor.steps[1]) for scan in scans]
         scans = np.where(np.isnan(scans), np.float32(np.nan), np.reshape(closed, scans.shape))
-    return resample(sensor, rays, scans) if angles in found else scans
+    return resample(sensor, rays, scans) if is_other else scans
 
 
-def _require_shape(
-    found: Mapping[str, np.ndarray], name: str, shape: tuple[int | str, ...], others: str = ""
-) -> None:
-    """Raises `ValueError` unless an array holds numbers in a shape, for C places or A rays."""
+def _array(
+    found: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...], advice: str = ""
+) -> np.ndarray:
+    """An array of a recording, which holds numbers in this shape."""
+    if name not in found:
+        raise ValueError(f"{name} is missing; a recording holds places, NAME_poses and NAME_scans")
     array = found[name]
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} must hold numbers, not {array.dtype}")
-    sizes = {"C": next(iter(found["places"].shape), None), "A": array.size}
-    if array.shape != tuple(sizes.get(str(size), size) for size in shape):
-        text = f"({', '.join(map(str, shape))})".replace("(A)", "(A,)")
-        of_places = " for C places" if "C" in shape else ""
-        raise ValueError(f"{name} has the shape {array.shape}; must be {text}{of_places}{others}")
+    if array.shape != shape:
+        raise ValueError(f"{name} has the shape {array.shape}; must be {shape}{advice}")
+    return array
 
 
 def resample(

@@ -9,8 +9,6 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 from jaxsense.sim import sensors as sensors
 from jaxsense.sim import windows as windows
-from jaxsense.sim.arena import Arena as Arena
-from jaxsense.sim.arena import Layout as Layout
 from jaxsense.sim.arena import build as build
 from jaxsense.sim.arena import drive as drive
 from jaxsense.sim.arena import make_layout as make_layout
@@ -21,16 +19,12 @@ from jaxsense.sim.domain import Domain as Domain
 from jaxsense.sim.light import Light as Light
 from jaxsense.sim.light import random_light as random_light
 from jaxsense.sim.raycast import CrossSection as CrossSection
-from jaxsense.sim.raycast import Hit as Hit
+from jaxsense.sim.raycast import Fan as Fan
+from jaxsense.sim.raycast import Pinhole as Pinhole
 from jaxsense.sim.raycast import cast as cast
-from jaxsense.sim.raycast import cast_along as cast_along
 from jaxsense.sim.raycast import choose as choose
 from jaxsense.sim.raycast import cross_section as cross_section
-from jaxsense.sim.rays import Fan as Fan
-from jaxsense.sim.rays import Pinhole as Pinhole
-from jaxsense.sim.rays import Rays as Rays
 from jaxsense.sim.sensors import Sensor as Sensor
-from jaxsense.sim.sensors import Surfaces as Surfaces
 from jaxsense.sim.sensors import scan as scan
 from jaxsense.sim.viewpoints import bearing as bearing
 from jaxsense.sim.windows import cut_out as cut_out

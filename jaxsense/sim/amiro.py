@@ -49,16 +49,15 @@ MAX_WHEEL_SPEED = (MAX_SPEED + MAX_TURN_RATE * WHEEL_SEPARATION / 2) / WHEEL_RAD
 
 
 def body(name: str, has_lidar: bool, reach: float) -> str:
-    """Writes the MJCF of one robot's body.
+    """MJCF of one robot's body.
+
+    Only the sphere in its middle collides: with upright cylinders, boxes and other robots, it
+    collides exactly where the robot's disc would.
 
     Args:
       name: prefix of the names of its parts.
       has_lidar: whether a sensor is mounted on top, in the case of a laser scanner.
       reach: maximum distance of the robot's centre from the origin along x and y, in metres.
-
-    Returns:
-      An MJCF `<body>` element. Only the sphere in its middle collides: with upright cylinders,
-      boxes and other robots, it collides exactly where the robot's disc would.
     """
     middle = GROUND_CLEARANCE + BODY_HEIGHT / 2
     tower = (LIDAR_TOP - BODY_TOP) / 2

@@ -8,6 +8,7 @@ part of the layout, so a new layout or class never recompiles anything.
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -29,14 +30,14 @@ _WALL_COLOUR = (0.6, 0.6, 0.6)
 
 @pytree
 class Layout:
-    """Positions, shapes and colours of the PoIs in one arena; no field is static.
+    """PoIs of one arena; no field is static.
 
     Attributes:
-      position: `[N, 2]` float32 centres of the PoIs, in metres from the arena's centre.
-      yaw: `[N]` float32, in radians.
+      position: `[N, 2]` centres, in metres from the arena's centre.
+      yaw: `[N]` in radians.
       shape: `[N]` int32 index into the shapes of the settings.
-      colour: `[N, 3]` float32 albedo, linear RGB in [0, 1].
-      values: `[N]` float32 value of each attribute in the settings.
+      colour: `[N, 3]` albedo, linear RGB in [0, 1].
+      values: `[N]` value of each attribute in the settings.
     """
 
     position: jax.Array
@@ -57,7 +58,7 @@ class Arena:
       mj_model: the model in C MuJoCo.
       model: the model in MJX.
       data: an MJX state for `place` to fill in.
-      num_robots: number of robots, which are named robot0, robot1 and so on.
+      num_robots: R; they are named robot0, robot1 and so on.
     """
 
     config: ArenaConfig
@@ -69,10 +70,13 @@ class Arena:
     @functools.cached_property
     def robot_of_geom(self) -> Int[np.ndarray, "G"]:
         """Index of the robot that each geom belongs to, or -1."""
-        bodies = [self.mj_model.body(f"robot{r}").id for r in range(self.num_robots)]
-        return np.array(
-            [bodies.index(b) if b in bodies else -1 for b in self.mj_model.geom_bodyid], np.int32
-        )
+        return np.maximum(self.mj_model.geom_bodyid - 1 - self.mj_model.nmocap, -1)
+
+    @functools.cached_property
+    def poi_of_geom(self) -> Int[np.ndarray, "G"]:
+        """Index of the PoI that each geom belongs to, or -1."""
+        body = self.mj_model.geom_bodyid - 1  # in the order of `_mjcf`: world, PoIs, robots
+        return np.where(body < self.mj_model.nmocap, body // len(self.config.shapes), -1)
 
     @functools.cached_property
     def geom_axes(self) -> Float[np.ndarray, "G 3 3"]:
@@ -82,16 +86,7 @@ class Arena:
             mujoco.mju_quat2Mat(row, quat)  # pyright: ignore[reportAttributeAccessIssue]
         return axes.reshape(-1, 3, 3).astype(np.float32)
 
-    @functools.cached_property
-    def poi_of_geom(self) -> Int[np.ndarray, "G"]:
-        """Index of the PoI that each geom belongs to, or -1."""
-        names = [self.mj_model.geom(g).name for g in range(self.mj_model.ngeom)]
-        return np.array(
-            [int(n.split("_")[0][3:]) if n.startswith("poi") else -1 for n in names], np.int32
-        )
 
-
-@checks.typed
 def build(
     config: ArenaConfig,
     lidar_robots: tuple[bool, ...],
@@ -106,9 +101,6 @@ def build(
       lidar_robots: for each robot, whether it carries a laser scanner, or another sensor on top.
       contacts: whether robots collide with PoIs, with each other and with the walls.
       obstacles: whether there are PoIs and walls.
-
-    Returns:
-      The arena; in its `data` every robot and PoI is at the origin.
 
     Raises:
       ConfigError: if JAX computes in 64 bits.
@@ -195,37 +187,25 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
 
-def _check_pois(config: ArenaConfig, name: str, value: jax.Array) -> None:
-    """Raises `ValueError` if an array is not of as many PoIs as the arena has."""
-    number = np.shape(value)[0] if np.ndim(value) else config.num_pois
-    if number != config.num_pois:
-        raise ValueError(f"{name} of {number} PoIs: must be {config.num_pois}, as arena.num_pois")
-
-
-@checks.typed
 def make_layout(
     config: ArenaConfig,
     position: Float[Array, "N 2"],
     yaw: Float[Array, "N"],
     classes: Int[Array, "N"],
 ) -> Layout:
-    """Builds the layout of PoIs of given classes.
+    """Layout of PoIs.
 
     Args:
       config: the arena.
       position: centres of the PoIs, in metres from the arena's centre.
-      yaw: orientations of the PoIs, in radians.
+      yaw: in radians.
       classes: index of each PoI's class in `config.classes`.
 
     Raises:
-      ValueError: if a position or a yaw is not finite, or there is no such class.
+      ValueError: if there is no such class.
     """
-    _check_pois(config, "position", position)
-    checks.require_shape("position", position, (config.num_pois, 2))
-    checks.require_shape("yaw", yaw, (config.num_pois,))
-    checks.require_shape("classes", classes, (config.num_pois,))
-    checks.require_finite("position", position)
-    checks.require_finite("yaw", yaw)
+    chex.assert_shape(position, (config.num_pois, 2))
+    chex.assert_shape([yaw, classes], (config.num_pois,))
     checks.require_index("classes", classes, len(config.classes))
     shapes = jnp.array([list(config.shapes).index(w) for w in config.words("shape")], jnp.int32)
     colours = jnp.array(config.values("colour"))
@@ -235,7 +215,7 @@ def make_layout(
 
 
 def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> Layout:
-    """Draws random positions of PoIs of given classes, at least `poi_gap` apart.
+    """Draws a layout of PoIs of given classes, at least `poi_gap` apart.
 
     The arena is divided into square cells, about twice as many as PoIs. Each PoI gets a cell of its
     own and a position that leaves half the gap free on every side.
@@ -244,14 +224,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
       key: random key.
       config: the arena.
       classes: index of each PoI's class in `config.classes`.
-
-    Returns:
-      The layout, with random yaws.
     """
-    checks.require_key(key)
-    checks.require_type("config", config, ArenaConfig, "as config.arena")
-    _check_pois(config, "classes", classes)
-    checks.require_shape("classes", classes, (config.num_pois,))
     per_side = min(
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
     )
@@ -268,26 +241,21 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     )
 
 
-@checks.typed
 def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
-    """Places PoIs and robots at rest, and all their geoms.
+    """MJX state with PoIs and robots at rest.
 
-    All bodies stand upright in the world, so one turn places a geom. `mjx.kinematics`, which
-    follows chains of joints, is a program of 36 times as many operations.
+    Only `geom_xpos` and `geom_xmat` follow from them; what else kinematics compute is that of
+    `arena.data`. All bodies stand upright in the world, so one turn places a geom.
+    `mjx.kinematics`, which follows chains of joints, is a program of 36 times as many operations.
 
     Args:
       arena: the arena.
       layout: the PoIs.
       poses: x [m], y [m] and yaw [rad] of each robot.
-
-    Returns:
-      The MJX state with up-to-date `geom_xpos` and `geom_xmat`; what else kinematics compute is
-      that of `arena.data`.
     """
     data = put(arena, layout, poses)
     pois = data.mocap_pos[: arena.mj_model.nmocap]
     turns = jnp.repeat(layout.yaw, len(arena.config.shapes))[: len(pois)]
-    # In the order of `_mjcf`: the world, with the walls, then PoIs and robots.
     body = jnp.asarray(arena.mj_model.geom_bodyid)
     robots = jnp.pad(poses[:, :2], ((0, 0), (0, 1)))
     origin = jnp.concatenate([jnp.zeros((1, 3)), pois, robots])[body]
@@ -303,15 +271,9 @@ def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
 
 
 def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
-    """Places PoIs and robots without the kinematics, which a physics step computes anyway.
-
-    Args:
-      arena: the arena.
-      layout: the PoIs.
-      poses: x [m], y [m] and yaw [rad] of each robot.
-    """
-    checks.require_shape("poses", poses, (arena.num_robots, 3))
-    check_layout(arena.config, layout)
+    """`place` without the kinematics, which a physics step computes anyway."""
+    chex.assert_shape(poses, (arena.num_robots, 3))
+    chex.assert_shape(layout.position, (arena.config.num_pois, 2))
     shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
     height = jnp.where(shown, arena.config.poi_height / 2, _STORE)
     position = jnp.concatenate(
@@ -326,45 +288,25 @@ def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
     )
 
 
-def check_layout(config: ArenaConfig, layout: Layout) -> None:
-    """Checks that a layout fits an arena.
-
-    Args:
-      config: the arena.
-      layout: the layout.
-
-    Raises:
-      ValueError: if an array of the layout has another shape; the message names it.
-    """
-    shapes = {"position": (2,), "yaw": (), "shape": (), "colour": (3,)}
-    for name, shape in shapes.items():
-        checks.require_shape(f"layout.{name}", getattr(layout, name), (config.num_pois, *shape))
-
-
-@checks.typed
 def robot_poses(data: mjx.Data) -> Float[Array, "R 3"]:
-    """Reads x [m], y [m] and yaw [rad] of each robot from the MJX state."""
+    """Each robot's x [m], y [m] and yaw [rad]."""
     return data.qpos.reshape(-1, 3)
 
 
-@checks.typed
 def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mjx.Data:
-    """Advances the physics by `TIMESTEP` seconds with commanded wheel speeds.
+    """Advances the physics by `TIMESTEP` seconds.
 
     Args:
       arena: the arena.
       data: the MJX state.
       wheel_speeds: left and right wheel speed of each robot, in rad/s.
-
-    Returns:
-      The next MJX state.
     """
-    checks.require_shape("wheel_speeds", wheel_speeds, (arena.num_robots, 2))
+    chex.assert_shape(wheel_speeds, (arena.num_robots, 2))
     # MJX relies on rank promotion, which the caller may have forbidden.
     with jax.numpy_rank_promotion("allow"):
         return mjx.step(arena.model, data.replace(ctrl=as_control(wheel_speeds)))
 
 
 def as_control(wheel_speeds: Float[Array, "R 2"]) -> Float[Array, "U"]:
-    """Makes MuJoCo's control vector of wheel speeds; the third actuator of a robot is passive."""
+    """MuJoCo's control vector; the third actuator of a robot is passive."""
     return jnp.pad(wheel_speeds, ((0, 0), (0, 1))).reshape(-1)

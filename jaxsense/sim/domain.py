@@ -36,13 +36,7 @@ class Domain:
     def contains(
         self, sensor: Sensor, bearing: Float[Array, ""], distance: Float[Array, ""]
     ) -> Bool[Array, ""]:
-        """Tells whether a look is one of those that the detector has learned from.
-
-        Args:
-          sensor: the sensor that looks.
-          bearing: of the PoI in the robot's frame, in radians; any turns.
-          distance: expected distance of the PoI's centre, in metres.
-        """
+        """Whether the detector has learned looks from this bearing [rad] and distance [m]."""
         least, most = sensor.steps
         limit = jnp.nan_to_num(sensor.window_limit)
         look = jnp.stack([distance, windows.wrapped(bearing), least, most, limit])
@@ -52,12 +46,7 @@ class Domain:
 
 
 def make_domain(config: Config, sensor: Sensor) -> Domain:
-    """Makes the domain of the detector that a training with these settings gives a sensor.
-
-    Args:
-      config: all settings.
-      sensor: one of `sensors.make(config)`.
-    """
+    """Domain of the detector that a training with these settings gives a sensor."""
     view, errors = config.viewpoint, config.mission.localisation
     deviations = _DEVIATIONS * errors.in_training
     off = view.max_bearing + view.bearing_error + deviations * errors.heading_error

@@ -1,14 +1,17 @@
-"""The light of a scene, and what changes it over positions and time."""
+"""The light of a scene, what changes it over positions and time, and what images make of it.
+
+Only reading noise is on by default; other disturbances cost nothing while off.
+"""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsense.core import checks
+from jaxsense.config import CameraConfig
 from jaxsense.core.types import Key, pytree
 
 _NUM_WAVES = 32
-_NUM_CONDITIONS = 8  # numbers that `disturbances.lighting` takes
+_NUM_CONDITIONS = 8  # numbers that `lighting` takes
 
 
 @pytree
@@ -41,8 +44,8 @@ class Light:
 
     Attributes:
       direction: `[3]` unit vector towards the light.
-      diffuse: `[]` strength of the distant light.
-      ambient: `[]` strength of the ambient light.
+      diffuse: strength of the distant light.
+      ambient: strength of the ambient light.
       conditions: exposure, colour and shadow, which drift; None if no sensor reads them.
       point: `[3]` where and when a sensor looks: x [m], y [m] and time [s]; None until
         `sensors.scan` sets it.
@@ -95,7 +98,6 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
       key: random key.
       has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
     """
-    checks.require_key(key)
     light_key, condition_key = jax.random.split(key)
     side, height, diffuse, ambient = jax.random.uniform(light_key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)
@@ -103,3 +105,31 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
     direction = jnp.stack([flat * jnp.cos(side), flat * jnp.sin(side), jnp.sin(height)])
     conditions = random_conditions(condition_key) if has_conditions else None
     return Light(direction, 0.2 + 0.6 * diffuse, 0.3 + 0.3 * ambient, conditions)
+
+
+def changes_light(config: CameraConfig) -> bool:
+    """Whether exposure, colour cast, low light or shadows are switched on."""
+    amounts = config.exposure_error, config.colour_cast, config.low_light, config.shadow
+    return any(amount > 0 for amount in amounts)
+
+
+def lighting(
+    values: Float[Array, "8"], place: Float[Array, "B"], config: CameraConfig
+) -> tuple[Float[Array, "3"], Float[Array, "B"]]:
+    """How an image is lit and exposed.
+
+    Args:
+      values: of the light's conditions where and when the camera looks.
+      place: of the pixels in the whole image, from 0 at its left to 1 at its right.
+      config: settings of the camera.
+
+    Returns:
+      Factors on the brightness of red, green and blue, and for each pixel 1 where the distant light
+      reaches the surface, 0 in shadow.
+    """
+    brightness, *casts = values[:4]
+    missing, falls, edge, side = jax.scipy.special.ndtr(values[4:])  # uniform from 0 to 1
+    logarithm = config.exposure_error * brightness + config.colour_cast * jnp.stack(casts)
+    gain = (1 - config.low_light * missing) * jnp.exp(logarithm)
+    is_dark = (falls < config.shadow) & ((place >= edge) == (side < 0.5))
+    return gain, jnp.where(is_dark, 0.0, 1.0)

@@ -14,16 +14,7 @@ from jaxsense.core.types import Key
 
 
 def draw(key: Key, config: LocalisationConfig, num_robots: int) -> Float[Array, "R 3"]:
-    """Draws the error of each robot's pose at the start of a mission.
-
-    Args:
-      key: random key.
-      config: the standard deviations.
-      num_robots: R.
-
-    Returns:
-      `[R, 3]` believed minus true x [m], y [m] and yaw [rad].
-    """
+    """Error of each robot's pose at the start of a mission: believed minus true [m, m, rad]."""
     scale = _scale(config.position_error, config.heading_error)
     return scale * jax.random.normal(key, (num_robots, 3))
 
@@ -34,14 +25,7 @@ def drift(
     error: Float[Array, "R 3"],
     driven: Float[Array, " R"],
 ) -> Float[Array, "R 3"]:
-    """Errors of the poses after the robots have driven on.
-
-    Args:
-      key: random key.
-      config: the standard deviations.
-      error: `[R, 3]` before, see `draw`.
-      driven: `[R]` metres since then.
-    """
+    """Errors after the robots have driven on for `driven` metres."""
     scale = _scale(config.position_drift, config.heading_drift)
     return error + scale * jnp.sqrt(driven)[:, None] * jax.random.normal(key, error.shape)
 
@@ -49,17 +33,10 @@ def drift(
 def aimed_at(
     position: Float[Array, "2"], pose: Float[Array, "3"], error: Float[Array, "3"]
 ) -> Float[Array, "2"]:
-    """Where a robot really heads when it drives to a position.
+    """Where a robot really heads when it drives to a position, in metres.
 
-    It takes the course that would lead there from the pose that it believes it has.
-
-    Args:
-      position: `[2]` in metres.
-      pose: `[3]` true pose.
-      error: `[3]` of the pose, see `draw`.
-
-    Returns:
-      `[2]` metres; without an error the position itself, to the last bit.
+    It takes the course that would lead there from the pose that it believes it has. Without an
+    error that is the position itself, to the last bit.
     """
     to_x, to_y = position - (pose + error)[:2]
     cos, sin = jnp.cos(error[2]) - 1, jnp.sin(error[2])

@@ -37,10 +37,6 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
     """The sensor with a window that contains those of a search; without one, the sensor itself.
 
     It reaches no farther than the scan, and as far as errors explain at 0.3 m or farther away.
-
-    Args:
-      sensor: the sensor.
-      search: the largest errors.
     """
     if not search.applies or len(sensor.angles) < 2:
         return sensor

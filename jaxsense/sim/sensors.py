@@ -9,6 +9,7 @@ import abc
 import dataclasses
 from typing import dataclass_transform
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +21,10 @@ from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, Lid
 from jaxsense.config.checks import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
-from jaxsense.sim import amiro, disturbances, raycast
-from jaxsense.sim.arena import Arena, Layout, check_layout, robot_poses
-from jaxsense.sim.light import Light
-from jaxsense.sim.rays import Fan, Pinhole, Rays
+from jaxsense.sim import amiro, raycast
+from jaxsense.sim.arena import Arena, Layout, robot_poses
+from jaxsense.sim.light import Light, changes_light, lighting
+from jaxsense.sim.raycast import Fan, Pinhole, Rays
 
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
 _ROUNDING = 1e-4  # of a brightness
@@ -38,23 +39,20 @@ Surfaces = dict[str, jax.Array]
 class Sensor(abc.ABC):
     """A scanline sensor on a robot, a frozen pytree.
 
-    A subclass defines `read`. It becomes a dataclass and a pytree without a
-    decorator; its own fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
+    A subclass defines `read`. It becomes a dataclass and a pytree without a decorator; its own
+    fields are leaves unless declared `flax.struct.field(pytree_node=False)`.
 
     Attributes:
-      name: name of the modality, which `make` takes from the settings; static.
-      height: height of the rays above the floor, in metres; static.
-      rays: directions of the rays; static.
-      window: number of rays that the detector reads; static.
-      channels: numbers in the reading of one ray; static.
-      stride: step between the rays that the detector reads; static.
-      ray_bytes: size of one ray's reading in a ROS message, in bytes; static.
+      name: of the modality, which `make` takes from the settings.
+      height: of the rays above the floor, in metres.
+      rays: their directions.
+      window: number of rays that the detector reads.
+      channels: numbers in the reading of one ray.
+      stride: step between the rays that the detector reads.
+      ray_bytes: size of one ray's reading in a ROS message.
       window_limit: highest reading in the detector's input.
-      measures_distance: whether readings are distances in metres; static.
+      measures_distance: whether readings are distances in metres.
       blind: reading of every ray after the sensor has failed.
-
-    Raises:
-      ValueError: if a size is not a whole number above 0, or the height is not above 0.
     """
 
     _: dataclasses.KW_ONLY
@@ -81,7 +79,7 @@ class Sensor(abc.ABC):
     def read(
         self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light
     ) -> Float[Array, "B *channels"]:
-        """Turns the hits of one scan into readings.
+        """Readings of one scan, `[B, channels]` if there are several channels.
 
         Args:
           key: random key of the noise.
@@ -89,26 +87,19 @@ class Sensor(abc.ABC):
             `hits.ray` tells.
           surfaces: colour and attributes of all geoms, for `raycast.choose`.
           light: the light, with the point where and when the sensor looks.
-
-        Returns:
-          `[B]` readings, or `[B, channels]` if there are several channels.
         """
 
     def from_left(
         self, windows: Float[np.ndarray, "*S F"]
     ) -> Float[np.ndarray, "*S window channels"]:
-        """Readings of the rays of a detector's inputs, from left to right.
-
-        Args:
-          windows: `[..., F]` inputs of the detector.
-        """
+        """Readings of the rays of a detector's inputs, from left to right."""
         rays = windows.reshape(*windows.shape[:-1], self.window, self.channels)
         return rays if self.angles[0] > self.angles[-1] else rays[..., ::-1, :]
 
     def is_valid(
         self, readings: Float[Array | np.ndarray, "*axes"]
     ) -> Bool[Array | np.ndarray, "*axes"]:
-        """Tells which readings the sensor can make; a beam without a return is infinitely long."""
+        """Which readings the sensor can make; a beam without a return is infinitely long."""
         return readings >= 0 if self.measures_distance else jnp.isfinite(readings)
 
     @property
@@ -147,10 +138,7 @@ class Sensor(abc.ABC):
 
     @property
     def steps(self) -> tuple[float, float]:
-        """Smallest and largest angle between neighbouring rays that a detector reads, in radians.
-
-        Both are 0 if it reads one ray.
-        """
+        """Smallest and largest angle between rays that a detector reads, in radians; 0 of one."""
         found = np.abs(np.diff(self.angles[:: self.stride]))
         return (float(found.min()), float(found.max())) if found.size else (0.0, 0.0)
 
@@ -167,11 +155,7 @@ class Sensor(abc.ABC):
 
 
 class Lidar(Sensor):
-    """A laser scanner: one distance in metres per beam, from right to left.
-
-    Attributes:
-      config: its settings.
-    """
+    """A laser scanner: one distance in metres per beam, from right to left."""
 
     config: LidarConfig
 
@@ -180,7 +164,7 @@ class Lidar(Sensor):
     ) -> Float[Array, "B *channels"]:
         """See `Sensor.read`."""
         del surfaces, light
-        return disturbances.measured_ranges(key, hits.distance, self.config)
+        return measured_ranges(key, hits.distance, self.config)
 
     @property
     def reads_neighbours(self) -> bool:
@@ -188,12 +172,42 @@ class Lidar(Sensor):
         return self.config.mixed_pixels > 0
 
 
-class Camera(Sensor):
-    """One line of a camera's pixels: linear RGB in [0, 1], from left to right.
+def measured_ranges(
+    key: Key, distance: Float[Array, "B"], config: LidarConfig
+) -> Float[Array, "B"]:
+    """Ranges that a laser scanner measures, in metres; `max_range` without a return.
 
-    Attributes:
-      config: its settings.
+    Args:
+      key: random key.
+      distance: true distances along neighbouring beams, in metres; infinite without a hit.
+      config: settings of the scanner.
     """
+    chex.assert_rank(distance, 1)
+    met, spread = distance, config.range_noise
+    if config.mixed_pixels > 0 or config.dropout > 0:
+        key, disturbance_key = jax.random.split(key)
+        met = _disturbed(disturbance_key, distance, config)
+    if config.range_noise_growth > 0:
+        spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
+    noise = spread * jax.random.normal(key, met.shape)
+    measured = jnp.clip(met + noise, config.min_range, config.max_range)
+    return jnp.where(met <= config.max_range, measured, config.max_range)
+
+
+def _disturbed(key: Key, distance: Float[Array, "B"], config: LidarConfig) -> Float[Array, "B"]:
+    """Distances with mixed pixels, infinite where a beam drops out."""
+    uniform = jax.random.uniform(key, (3, *distance.shape))
+    # The last beam has no neighbour.
+    following = jnp.append(distance[1:], distance[-1:])
+    # Nothing lies between a surface and nothing. The scanner detects nothing beyond its range.
+    is_edge = jnp.maximum(distance, following) <= config.max_range
+    between = distance + uniform[0] * jnp.where(is_edge, following - distance, 0.0)
+    met = jnp.where(uniform[1] < config.mixed_pixels, between, distance)
+    return jnp.where(uniform[2] < config.dropout, jnp.inf, met)
+
+
+class Camera(Sensor):
+    """One line of a camera's pixels: linear RGB in [0, 1], from left to right."""
 
     config: CameraConfig
 
@@ -212,9 +226,8 @@ class Camera(Sensor):
         direct, gain = light.diffuse * jnp.maximum(facing, 0.0), None
         if self.reads_conditions:
             values = light.changes(self.config.light_distance, self.config.light_time)
-            checks.require_shape("hits.ray", hits.ray, hits.geom.shape)
             place = jnp.asarray(hits.ray) / self.config.num_pixels
-            gain, is_lit = disturbances.lighting(values, place, self.config)
+            gain, is_lit = lighting(values, place, self.config)
             direct = direct * is_lit
         shade = light.ambient + direct
         noise = self.config.pixel_noise * jax.random.normal(key, (3, *hits.geom.shape))
@@ -233,11 +246,11 @@ class Camera(Sensor):
     @property
     def reads_conditions(self) -> bool:
         """See `Sensor.reads_conditions`: whether the settings change the light."""
-        return disturbances.changes_light(self.config)
+        return changes_light(self.config)
 
 
 def lidar(config: LidarConfig) -> Lidar:
-    """Makes the built-in LiDAR; its settings may be traced."""
+    """The built-in LiDAR; its settings may be traced."""
     return Lidar(
         config,
         name="lidar",
@@ -252,7 +265,7 @@ def lidar(config: LidarConfig) -> Lidar:
 
 
 def camera(config: CameraConfig) -> Camera:
-    """Makes the built-in camera; its settings may be traced."""
+    """The built-in camera; its settings may be traced."""
     return Camera(
         config,
         name="camera",
@@ -267,10 +280,9 @@ def camera(config: CameraConfig) -> Camera:
 
 
 def make(config: Config) -> tuple[Sensor, ...]:
-    """Makes the sensor of each modality, in the order of `config.modalities`.
+    """Sensor of each modality, in the order of `config.modalities`.
 
-    Args:
-      config: all settings; numbers that are declared `Traced` may be traced.
+    Numbers of `config` that are declared `Traced` may be traced.
 
     Raises:
       ConfigError: if a custom sensor cannot be imported, is no `Sensor`, or does not fit the arena.
@@ -283,12 +295,7 @@ def make(config: Config) -> tuple[Sensor, ...]:
 
 
 def on_top(config: Config, carried: tuple[str, ...]) -> tuple[bool, ...]:
-    """Which robots have a sensor on top of their bodies.
-
-    Args:
-      config: all settings.
-      carried: modality of each robot.
-    """
+    """Which robots, by the modality that they carry, have a sensor on top of their bodies."""
     is_on_top = {sensor.name: sensor.is_on_top for sensor in make(config)}
     return tuple(is_on_top[name] for name in carried)
 
@@ -311,15 +318,7 @@ def _own(name: str, config: Config) -> Sensor:
 
 
 def surfaces(arena: Arena, layout: Layout) -> Surfaces:
-    """Looks up colour and attributes of all geoms.
-
-    Args:
-      arena: the arena, for the surfaces of walls and robots.
-      layout: the PoIs, for theirs.
-
-    Returns:
-      Colour and attributes of all geoms.
-    """
+    """Colour and attributes of all geoms."""
     poi = jnp.array(arena.poi_of_geom)
     albedo = jnp.where((poi >= 0)[:, None], layout.colour[poi], arena.model.geom_rgba[:, :3])
     own = {
@@ -341,7 +340,7 @@ def scan(
     seconds: Float[Array, ""] | float = 0.0,
     twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "B *channels"]:
-    """Simulates a scan by a robot's sensor, along all of its rays or some of them.
+    """Readings of a robot's sensor, along all of its rays or some of them.
 
     Args:
       key: random key of the noise.
@@ -357,16 +356,10 @@ def scan(
       seconds: time of the scan, over which the light changes.
       twin: position of one more robot with the body of the one that scans, in metres.
 
-    Returns:
-      The readings of these rays.
-
     Raises:
       ValueError: if the sensor reads the light's conditions, and they have not been drawn.
     """
-    checks.require_key(key)
-    checks.require_shape("directions", directions, (2, None))
-    checks.require_shape("light.direction", light.direction, (3,))
-    check_layout(arena.config, layout)
+    chex.assert_shape(directions, (2, None))
     pose = robot_poses(data)[robot]
     section = _section(arena, data, sensor.height, robot, twin)
     x, y = directions

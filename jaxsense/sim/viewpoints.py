@@ -1,12 +1,12 @@
 """Poses from which a sensor faces a PoI, in range and free of collisions."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ArenaConfig, ViewpointConfig
-from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
@@ -22,7 +22,7 @@ def random_viewpoint(
     others: Float[Array, "K 2"],
     poi: Int[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Draws a pose from which a robot looks at a PoI.
+    """Pose from which a robot looks at a PoI, and the bearing of the PoI as it believes it.
 
     Candidates are uniform in distance and direction. Returns the first one that is free and has an
     unobstructed view of the PoI, or the one with the most room if there is none.
@@ -34,13 +34,8 @@ def random_viewpoint(
       layout: the PoIs.
       others: positions of the other robots, in metres.
       poi: index of the PoI to look at.
-
-    Returns:
-      The pose, x [m], y [m] and yaw [rad], and the bearing of the PoI in the robot's frame as the
-      robot believes it, in radians.
     """
-    checks.require_shape("others", others, (None, 2))
-    checks.require_shape("poi", poi, ())
+    chex.assert_shape(others, (None, 2))
     # A single draw, because each use of the random generator takes long to compile.
     draws = jax.random.uniform(key, (2 * NUM_CANDIDATES + 2,))
     near, far = config.min_distance, config.max_distance
@@ -67,25 +62,10 @@ def moved_viewpoint(
     position: Float[Array, "2"],
     distance: Float[Array, ""],
 ) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Draws another pose from which a robot looks at a PoI, at a given distance from a place.
+    """`random_viewpoint` at a distance from a place, in metres.
 
-    Args:
-      key: random key.
-      config: settings of viewpoints.
-      arena: the sizes of arena and PoIs.
-      layout: the PoIs.
-      others: positions of the other robots, in metres.
-      poi: index of the PoI to look at.
-      position: x and y of the place, in metres.
-      distance: between the place and the pose, in metres.
-
-    Returns:
-      The pose and the believed bearing of the PoI, as in `random_viewpoint`. The pose is at the
-      place itself if no free one at that distance is in range and shows the PoI.
+    The pose is at the place itself if no free one at that distance is in range and shows the PoI.
     """
-    checks.require_shape("position", position, (2,))
-    checks.require_shape("poi", poi, ())
-    checks.require_shape("distance", distance, ())
     draws = jax.random.uniform(key, (NUM_CANDIDATES + 2,))
     direction, target = jnp.pi * (2 * draws[:-2] - 1), layout.position[poi]
     x = position[0] + distance * jnp.cos(direction)
@@ -111,17 +91,8 @@ def _bearings(
 def bearing(
     pose: Float[Array | np.ndarray, "3"], position: Float[Array | np.ndarray, "2"]
 ) -> Float[Array, ""]:
-    """Computes the bearing of a position in a robot's frame.
-
-    Args:
-      pose: x [m], y [m] and yaw [rad] of the robot.
-      position: x and y of the position, in metres.
-
-    Returns:
-      The angle from the robot's heading, positive to the left, in radians within -pi and pi.
-    """
-    checks.require_shape("pose", pose, (3,))
-    checks.require_shape("position", position, (2,))
+    """Bearing of a position in a robot's frame, positive to the left, within -pi and pi."""
+    chex.assert_shape(pose, (3,))
     offset = position - pose[:2]
     angle = jnp.arctan2(offset[1], offset[0]) - pose[2]
     return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
@@ -136,22 +107,20 @@ def free_room(
     others: Float[Array, "K 2"],
     poi: Index,
 ) -> Float[Array, "V"]:
-    """Free room around V viewpoints and in the view from them.
+    """Smallest margin to walls, robots and PoIs of V viewpoints, in metres.
+
+    It is 0 or less where a robot would be too close to something, or something hides part of the
+    PoI.
 
     Args:
-      x: x of the viewpoints, in metres.
-      y: y of the viewpoints, in metres.
+      x: of the viewpoints, in metres.
+      y: of the viewpoints, in metres.
       clearance: free space that a robot needs around it, in metres.
       arena: the sizes of arena and PoIs.
       layout: the PoIs.
       others: positions of the other robots, in metres.
       poi: index of the PoI to look at.
-
-    Returns:
-      The smallest margin to walls, robots and PoIs, in metres; 0 or less where a robot would be too
-      close to something, or something hides part of the PoI.
     """
-    checks.require_shape("y", y, jnp.shape(x))
     reach = amiro.BODY_RADIUS + clearance
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach
     target = layout.position[poi]

@@ -52,12 +52,6 @@ class World:
         self.seen, self.x = jnp.zeros(2, bool), jnp.zeros(2)
         self.look = jnp.array([0.75, 0.25])
 
-    def outlines(self, **parts):
-        """A circle and a rectangle."""
-        axis = jnp.array([[1.0, 0.0], [1.0, 0.0]])
-        given = {"centre": 2 * axis, "axis": axis, "half": axis * 0 + 0.5, "geom": (0, 1)}
-        return sim.CrossSection(**{**given, "num_circles": 1, **parts})
-
     def belief_of(self, **parts):
         return dataclasses.replace(self.belief, **parts)
 
@@ -338,37 +332,13 @@ FUNCTIONS = {
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
         "classes = 7: must be a whole number from 0 to 2",
     ),
-    "make_layout few": (
-        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), w.classes[:2]),
-        "classes has the shape (2,): must be (3,)",
-    ),
     "make_layout dtype": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD * 1.0),
         "classes of dtype float32: must be a whole number",
     ),
-    "make_layout position": (
-        lambda w: sim.make_layout(SMOKE.arena, jnp.full((3, 2), NAN), jnp.zeros(3), w.classes),
-        "position = nan",
-    ),
-    "make_layout yaw": (
-        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.full(3, INF), w.classes),
-        "yaw = inf",
-    ),
     "random_layout": (
         lambda w: sim.random_layout(w.key, SMOKE.arena, w.classes - 1),
         "classes = -1",
-    ),
-    "random_layout config": (
-        lambda w: sim.random_layout(w.key, SMOKE, w.classes),
-        ": must be ArenaConfig, as config.arena",
-    ),
-    "random_layout number": (
-        lambda w: sim.random_layout(w.key, SMOKE.arena, w.classes[:2]),
-        "classes of 2 PoIs: must be 3, as arena.num_pois",
-    ),
-    "make_layout number": (
-        lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((5, 2)), jnp.zeros(3), w.classes),
-        "position of 5 PoIs: must be 3, as arena.num_pois",
     ),
     "roadmap config": (
         lambda w: roadmap.build(SMOKE.arena, w.scene.layout),
@@ -394,70 +364,9 @@ FUNCTIONS = {
         ),
         "scene.poses = nan: must be finite",
     ),
-    "scan layout": (
-        lambda w: sim.scan(
-            w.key,
-            w.lidar,
-            w.world.arena,
-            w.world.arena.data,
-            dataclasses.replace(w.scene.layout, yaw=jnp.zeros(2)),
-            w.scene.light,
-            1,
-            jnp.array(w.lidar.directions),
-        ),
-        "layout.yaw",
-    ),
-    "place": (lambda w: sim.place(w.world.arena, w.scene.layout, jnp.zeros(3)), "poses"),
-    "drive": (
-        lambda w: sim.drive(w.world.arena, w.world.arena.data, jnp.zeros((3, 2))),
-        "wheel_speeds",
-    ),
     "cross_section robot": (
         lambda w: sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 5),
         "robot = 5",
-    ),
-    "cross_section height": (
-        lambda w: sim.cross_section(w.world.arena, w.world.arena.data, NAN, 0),
-        "height = nan",
-    ),
-    "cast": (
-        lambda w: sim.cast(
-            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x * NAN, w.x
-        ),
-        "origin = nan: must be finite",
-    ),
-    "cast_along": (
-        lambda w: sim.cast_along(
-            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x, (w.x, w.x * NAN)
-        ),
-        "direction = nan: must be finite",
-    ),
-    "cast_along no unit": (
-        lambda w: sim.cast_along(
-            sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 0), w.x, (w.x, w.x * 0)
-        ),
-        "length of direction = ",
-    ),
-    "cast list": (lambda w: sim.cast(w.outlines(), w.x, [0.0]), "angle = [0.0]: must be an array"),
-    "cast dict": (
-        lambda w: sim.cast({"geom": ()}, w.x, 0.0),
-        "section = {'geom': ()}: must be CrossSection, as from cross_section",
-    ),
-    "cast geom": (
-        lambda w: sim.cast(w.outlines(geom=(5,)), w.x, 0.0),
-        "geom has 1 entries: must be 2, one for each outline",
-    ),
-    "CrossSection words": (
-        lambda w: w.outlines(geom=("door", "wall")),
-        "geom = ('door', 'wall'): must hold whole numbers, 0 or more",
-    ),
-    "CrossSection negative": (
-        lambda w: w.outlines(geom=(-1, 0)),
-        "geom = (-1, 0): must hold whole",
-    ),
-    "CrossSection circles": (
-        lambda w: w.outlines(num_circles=1.0),
-        "num_circles = 1.0: must be a whole number, static under jit",
     ),
     "replay capacity": (lambda w: replay.init(3, 0, 4, 2), "rounds = 0: must be a whole number"),
     "replay empty": (
@@ -542,12 +451,6 @@ FUNCTIONS = {
         lambda w: retrain(w, labels=np.zeros(8)),
         "labels of dtype float32: must be a whole number from 0 to 1",
     ),
-    "fan": (lambda w: sim.Fan(0, 90.0), "num_rays = 0: must be a whole number greater than 0"),
-    "fan real": (lambda w: sim.Fan(1.5, 90.0), "num_rays = 1.5"),
-    "fan bool": (lambda w: sim.Fan(True, 90.0), "num_rays = True"),
-    "fan angle": (lambda w: sim.Fan(3, 400.0), "field_of_view = 400.0: must be above 0"),
-    "fan nan": (lambda w: sim.Fan(3, NAN), "field_of_view = nan"),
-    "fan negative": (lambda w: sim.Fan(3, -90.0), "field_of_view = -90.0"),
     "cut_out nan": (lambda w: sim.cut_out(w.lidar, np.full(683, NAN), 0.0), "readings of lidar ="),
     "cut_out negative": (lambda w: sim.cut_out(w.lidar, np.full(683, -1.0), 0.0), "= -1.0: must"),
     "cut_out length": (lambda w: sim.cut_out(w.lidar, np.zeros(5), 0.0), "readings of lidar"),
@@ -557,8 +460,6 @@ FUNCTIONS = {
     ),
     "cut_out degrees": (lambda w: sim.cut_out(w.lidar, np.zeros(683), 90.0), "bearing = 90.0"),
     "cut_out bearing": (lambda w: sim.cut_out(w.lidar, np.zeros(683), NAN), "bearing = nan"),
-    "bearing pose": (lambda w: sim.bearing(w.x, w.x), "pose"),
-    "bearing position": (lambda w: sim.bearing(jnp.zeros(3), jnp.zeros(3)), "position"),
     "Sensor stride": (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
     "Sensor window": (lambda w: dataclasses.replace(w.lidar, window=1.5), "window = 1.5"),
     "Sensor channels": (lambda w: dataclasses.replace(w.lidar, channels=-1), "channels = -1"),

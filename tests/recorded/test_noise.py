@@ -10,7 +10,7 @@ import pytest
 from jaxsense import recorded
 from jaxsense.config import LidarConfig
 from jaxsense.recorded import noise as noises
-from jaxsense.sim import disturbances, raycast
+from jaxsense.sim import raycast, sensors
 
 ANGLES = np.radians(np.linspace(-90, 90, 361)).astype(np.float32)
 
@@ -29,7 +29,7 @@ def rooms(noise, number=1500):
         half = jnp.stack([jnp.full(2, 0.3), jnp.stack([3.0 + size, 3.0 + x])])
         section = raycast.CrossSection(centre, axis, half, (0, 1), 0)
         distance = raycast.cast(section, jnp.zeros(2), angles).distance
-        return disturbances.measured_ranges(noise_key, distance, noise)
+        return sensors.measured_ranges(noise_key, distance, noise)
 
     ranges = np.asarray(scan(jax.random.split(jax.random.key(0), number)))
     return np.where(ranges >= noise.max_range, np.inf, ranges)

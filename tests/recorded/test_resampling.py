@@ -75,15 +75,6 @@ def test_a_full_circle_is_closed():
     )
 
 
-def test_a_circle_has_an_edge_where_its_ends_measure_two_surfaces():
-    angles = degrees(*range(-178, 180, 10))
-    readings = np.full((1, 36), 2.0)
-    readings[0, 0] = 1.0
-    found = recorded.resample(AROUND, angles, readings)[0]
-    # The ray at -180 is 2 degrees before that at -178, 8 after that at 172.
-    np.testing.assert_allclose(found[[0, 1, 35, 36]], [1.0, 2.0, 2.0, 1.0])
-
-
 def test_a_circle_with_a_gap_behind_is_open():
     sensor = sensors.lidar(LidarConfig(num_beams=361, field_of_view=360.0, window=20))
     angles = degrees(*range(-160, 161))
@@ -97,14 +88,6 @@ def test_pixels_are_interpolated_for_each_channel():
     found = recorded.resample(CAMERA, angles, colour)[0]
     expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.ones(8)], axis=-1)
     np.testing.assert_allclose(found, expected, atol=2e-3)
-
-
-def test_a_gap_in_the_recording_was_not_recorded():
-    sensor = sensors.lidar(LidarConfig(num_beams=81, field_of_view=80.0, window=20))
-    angles = degrees(*range(-40, -9), *range(10, 41))
-    found = recorded.resample(sensor, angles, np.ones((1, len(angles))))[0]
-    is_gap = np.abs(np.arange(-40, 41)) < 9.5
-    np.testing.assert_array_equal(np.isnan(found), is_gap)
 
 
 @pytest.mark.parametrize(

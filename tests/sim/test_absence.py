@@ -41,7 +41,7 @@ def looks():
         data = arenas.place(simulation.arena, layout, view.poses)
         sensor = sensors[robot]
         section = sim.cross_section(simulation.arena, data, sensor.height, robot)
-        angles = windows.window_of(sensor, sensor.angles, view.bearing)
+        angles = windows.around(sensor, sensor.angles, view.bearing)
         hits = sim.cast(section, view.poses[robot, :2], view.poses[robot, 2] + angles)
         poi_of_geom = jnp.array(simulation.arena.poi_of_geom)
         is_poi = (hits.geom >= 0) & (poi_of_geom[hits.geom] == 0)

@@ -8,13 +8,9 @@ import pytest
 from jaxsense import sim
 from jaxsense.config import ArenaConfig
 
-CLASSES = jnp.array([0, 1, 2])
 STEPS = 200
 TIMESTEP = 0.01  # s
 FREE_TOLERANCE = 2e-5  # m, rad, m/s and rad/s, over 2 s of float32 against float64
-# MJX finds the contact of a sphere and a cylinder by iteration, C MuJoCo in closed form: they may
-# differ by one step of 0.01 s at 0.22 m/s in when they meet.
-CONTACT_TOLERANCE = 3e-3  # m, rad
 
 
 def driver(arena):
@@ -66,21 +62,6 @@ def drive_in_contact(contact_arena):
     return driver(contact_arena)
 
 
-@pytest.fixture(scope="module")
-def contact_run(contact_arena, drive_in_contact):
-    """Robot 0 drives along x against a PoI that starts 0.35 m ahead, robot 1 against the wall."""
-
-    def run(kind):
-        position = jnp.array([[0.5, 0.0], [-0.8, -0.8], [0.8, -0.8]])
-        layout = sim.make_layout(ArenaConfig(), position, jnp.zeros(3), jnp.array([kind, 0, 2]))
-        poses = jnp.array([[0.05, 0.0, 0.0], [0.2, 1.2, np.pi / 2]])
-        speeds = np.full((STEPS, 2, 2), 8.0, np.float32)
-        start, states = drive_in_contact(layout, poses, speeds)
-        return states, native_trajectory(contact_arena, start, speeds)
-
-    return run
-
-
 def test_placed_geoms_agree_with_c_mujoco(place, set_native):
     layouts = jax.jit(lambda key, c: sim.random_layout(key, ArenaConfig(), c))
     rng = np.random.default_rng(0)
@@ -119,11 +100,6 @@ def test_place_shows_each_poi_once_in_its_shape_and_turns_it(arena, place):
     np.testing.assert_allclose(lidar, [1.0, -1.0, 0.129], atol=1e-6)
 
 
-def test_one_step_lasts_ten_milliseconds(arena):
-    assert arena.mj_model.opt.timestep == pytest.approx(TIMESTEP)
-    assert float(arena.model.opt.timestep) == pytest.approx(TIMESTEP)
-
-
 def test_robot_has_the_urdf_sizes_and_mass(arena):
     body = arena.mj_model.geom("robot0_body")
     np.testing.assert_allclose(body.size[:2], [0.099 / 2, 0.084 / 2])
@@ -132,14 +108,6 @@ def test_robot_has_the_urdf_sizes_and_mass(arena):
     np.testing.assert_allclose(left.size[:2], [0.05571 / 2, 0.006 / 2])
     np.testing.assert_allclose(left.pos - right.pos, [0, 0.069, 0], atol=1e-9)
     assert arena.mj_model.body("robot0").mass == pytest.approx(0.4 + 2 * 0.02)
-
-
-@pytest.mark.parametrize("contacts", [False, True])
-def test_only_an_arena_with_contacts_collides(arena, contact_arena, contacts):
-    mj_model = (contact_arena if contacts else arena).mj_model
-    mj_data = mujoco.MjData(mj_model)
-    mujoco.mj_forward(mj_model, mj_data)  # every robot and PoI at the origin
-    assert (mj_data.ncon > 0) == contacts
 
 
 def test_free_trajectory_agrees_with_c_mujoco(arena, drive_freely, known_layout):
@@ -152,25 +120,6 @@ def test_free_trajectory_agrees_with_c_mujoco(arena, drive_freely, known_layout)
     for name, ours, theirs in zip(("qpos", "qvel", "xpos", "xmat"), states, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=0, atol=FREE_TOLERANCE, err_msg=name)
     assert np.abs(expected[1]).max(axis=0).min() > 0.1  # they did move
-
-
-@pytest.mark.parametrize("kind", [0, 2], ids=["cylinder", "cube"])
-def test_contact_trajectory_agrees_with_c_mujoco(contact_run, kind):
-    (qpos, qvel, *_), (expected_qpos, expected_qvel, *_) = contact_run(kind)
-    np.testing.assert_allclose(qpos, expected_qpos, rtol=0, atol=CONTACT_TOLERANCE)
-    # Touching begins after (0.5 - 0.1 - 0.0495 - 0.05) m / 0.223 m/s = 1.35 s, not before.
-    np.testing.assert_allclose(qvel[:120, :3], expected_qvel[:120, :3], rtol=0, atol=FREE_TOLERANCE)
-    np.testing.assert_allclose(qvel[-1], expected_qvel[-1], rtol=0, atol=0.01)
-
-
-@pytest.mark.parametrize("kind", [0, 2], ids=["cylinder", "cube"])
-def test_robots_stop_at_a_poi_and_at_a_wall(contact_run, kind):
-    (qpos, qvel, *_), _ = contact_run(kind)
-    # A PoI of 0.1 at x = 0.5 stops a robot of 0.0495 at x = 0.3505, the wall at y = 1.5 another at
-    # 1.4505; soft contacts give way by some millimetres.
-    assert 0.345 < qpos[-1, 0] < 0.3505 + 0.005
-    assert 1.445 < qpos[-1, 4] < 1.4505 + 0.005
-    assert np.abs(qvel[-1, [0, 4]]).max() < 0.01
 
 
 @pytest.fixture(scope="module")
@@ -259,15 +208,6 @@ def test_as_many_pois_as_the_config_accepts_can_be_placed():
     np.testing.assert_allclose(found, [(x, y) for x in middles for y in middles], atol=1e-5)
 
 
-def test_colours_and_shapes_follow_the_classes():
-    config = ArenaConfig(num_pois=4, classes=("blue cube", "red cylinder", "green cube"))
-    classes = jnp.array([1, 0, 2, 1])
-    layout = sim.random_layout(jax.random.key(0), config, classes)
-    np.testing.assert_array_equal(layout.shape, [0, 1, 1, 0])
-    red, blue, green = (0.8, 0.1, 0.1), (0.1, 0.2, 0.8), (0.1, 0.7, 0.1)
-    np.testing.assert_allclose(layout.colour, [red, blue, green, red])
-
-
 def test_new_layouts_and_classes_do_not_retrace(arena):
     chex.clear_trace_counter()
 
@@ -285,27 +225,6 @@ def test_new_layouts_and_classes_do_not_retrace(arena):
     ]
     assert look_around._cache_size() == 1
     assert not np.allclose(seen[0], seen[1])
-
-
-@pytest.mark.parametrize(
-    ("name", "call"),
-    [
-        ("position", lambda c, n: sim.make_layout(c, jnp.zeros((n, 2)), jnp.zeros(3), CLASSES)),
-        ("yaw", lambda c, n: sim.make_layout(c, jnp.zeros((3, 2)), jnp.zeros(n), CLASSES)),
-        ("classes", lambda c, n: sim.random_layout(jax.random.key(0), c, jnp.zeros(n, jnp.int32))),
-    ],
-)
-def test_wrong_shapes_of_a_layout_are_named_while_tracing(name, call):
-    jax.eval_shape(lambda: call(ArenaConfig(), 3))
-    with pytest.raises(ValueError, match=name):
-        jax.eval_shape(lambda: call(ArenaConfig(), 4))
-
-
-def test_wrong_shapes_of_poses_and_speeds_are_named_while_tracing(arena, known_layout):
-    with pytest.raises(ValueError, match="poses"):
-        jax.eval_shape(lambda poses: sim.place(arena, known_layout, poses), jnp.zeros((3, 3)))
-    with pytest.raises(ValueError, match="wheel_speeds"):
-        jax.eval_shape(lambda speeds: sim.drive(arena, arena.data, speeds), jnp.zeros((2, 3)))
 
 
 FAR = [[-0.8, 0.8], [-0.8, -0.8], [0.8, -0.8]]

@@ -10,7 +10,8 @@ import scipy.stats
 
 from jaxsense import sim
 from jaxsense.config import CameraConfig, LidarConfig, ViewpointConfig
-from jaxsense.sim import disturbances, sensors, windows, world
+from jaxsense.sim import light as lights
+from jaxsense.sim import sensors, windows, world
 from jaxsense.sim.light import Light, random_conditions
 from jaxsense.sim.raycast import Hit
 
@@ -19,38 +20,13 @@ KEYS = jax.random.split(jax.random.key(0), NUMBER)
 EXACT = {"range_noise": 0.0, "max_range": 5.0}
 
 
-measure = jax.jit(jax.vmap(disturbances.measured_ranges, in_axes=(0, None, None)))
-lighting_of = jax.jit(jax.vmap(disturbances.lighting, in_axes=(0, None, None)))
+measure = jax.jit(jax.vmap(sensors.measured_ranges, in_axes=(0, None, None)))
 TENTHS = jnp.arange(10) / 10
 
 
 def ranges(distance, **settings):
     """`[NUMBER, B]` measurements of the same distances."""
     return np.asarray(measure(KEYS, np.float32(distance), LidarConfig(**settings)))
-
-
-@pytest.fixture(scope="module")
-def values():
-    """`[NUMBER, 8]` conditions of many scenes where and when somebody looks."""
-    point = jnp.array([1.0, -2.0, 3.0])
-    return jax.jit(jax.vmap(lambda key: random_conditions(key).at(point)))(KEYS)
-
-
-@pytest.fixture(scope="module")
-def lighting(values):
-    def of_scenes(**settings):
-        gain, is_lit = lighting_of(values, TENTHS, CameraConfig(**settings))
-        return np.asarray(gain), np.asarray(is_lit)
-
-    return of_scenes
-
-
-def test_a_lidar_without_disturbances_has_noise_alone():
-    config, key = LidarConfig(range_noise=0.02), KEYS[0]
-    distance = jnp.array([1.0, 2.0, jnp.inf, 4.999])
-    noise = 0.02 * jax.random.normal(key, (4,))
-    expected = jnp.array([1.0 + noise[0], 2.0 + noise[1], 5.0, jnp.minimum(4.999 + noise[3], 5.0)])
-    np.testing.assert_array_equal(disturbances.measured_ranges(key, distance, config), expected)
 
 
 def test_noise_grows_with_the_distance():
@@ -132,49 +108,19 @@ def test_a_beam_that_drops_out_reads_as_one_without_a_return():
     assert np.mean(np.all(found == 5.0, axis=1)) == pytest.approx(0.09, abs=0.01)
 
 
-def test_a_camera_without_disturbances_changes_nothing(lighting):
-    gain, is_lit = lighting()
-    np.testing.assert_array_equal(gain, 1.0)
-    np.testing.assert_array_equal(is_lit, 1.0)
-
-
-def test_exposure_is_that_of_all_channels_and_a_cast_that_of_each(lighting):
-    logarithm = np.log(lighting(exposure_error=0.5)[0])
-    np.testing.assert_allclose(logarithm, logarithm[:, :1] * [1.0, 1.0, 1.0], atol=1e-6)
-    assert logarithm.std() == pytest.approx(0.5, rel=0.02)
-    logarithm = np.log(lighting(colour_cast=0.2)[0])
-    np.testing.assert_allclose(np.cov(logarithm.T), 0.04 * np.eye(3), atol=0.002)
-
-
-def test_missing_light_is_uniform(lighting):
-    gain, _ = lighting(low_light=0.8)
-    np.testing.assert_array_equal(gain[:, 0], gain[:, 1])
-    assert gain.min() == pytest.approx(0.2, abs=0.001)
-    assert gain.max() == pytest.approx(1.0, abs=0.001)
-    assert gain.mean() == pytest.approx(0.6, abs=0.01)
-    assert gain.std() == pytest.approx(0.8 / 12**0.5, rel=0.02)
-
-
-def test_a_shadow_covers_one_side_from_a_random_pixel_on(lighting):
-    _, is_lit = lighting(shadow=0.4)
-    # One edge at most; half of all shadows in each pixel.
-    assert np.abs(np.diff(is_lit, axis=1)).sum(axis=1).max() == 1
-    np.testing.assert_allclose(np.mean(is_lit == 0, axis=0), 0.2, atol=0.015)
-
-
 def test_hand_worked_light():
     config = CameraConfig(exposure_error=0.5, colour_cast=0.1, low_light=0.8, shadow=0.4)
     # A standard normal value is below -.253347 with a chance of .4, below .524401 with .7, and
     # below .5 with .691.
     values = jnp.array([2.0, 1.0, 0.0, -1.0, 0.524401, -0.2534, 0.5, 0.1])
-    gain, is_lit = disturbances.lighting(values, TENTHS, config)
+    gain, is_lit = lights.lighting(values, TENTHS, config)
     # (1 - .8 * .7) exp(.5 * 2 + .1 * {1, 0, -1}); dark before pixel 7, the first beyond .691.
     expected = 0.44 * np.exp([1.1, 1.0, 0.9])
     np.testing.assert_allclose(gain, expected, rtol=1e-5)
     np.testing.assert_array_equal(is_lit, [0] * 7 + [1] * 3)
-    _, is_lit = disturbances.lighting(values.at[7].set(-0.1), TENTHS, config)
+    _, is_lit = lights.lighting(values.at[7].set(-0.1), TENTHS, config)
     np.testing.assert_array_equal(is_lit, [1] * 7 + [0] * 3)
-    _, is_lit = disturbances.lighting(values.at[5].set(-0.2532), TENTHS, config)
+    _, is_lit = lights.lighting(values.at[5].set(-0.2532), TENTHS, config)
     np.testing.assert_array_equal(is_lit, 1)
 
 

@@ -104,13 +104,6 @@ def test_an_unevenly_spaced_sensor_is_not_the_one_that_was_learned():
     assert DOMAINS[1].contains(even, jnp.float32(0), jnp.float32(1))
 
 
-def test_a_sensor_of_one_ray_has_a_domain():
-    sensor = changed(LIDAR, num_beams=1, window=1)
-    found = make_domain(CONFIG, sensor)
-    assert sensor.steps == (0.0, 0.0)
-    assert bool(found.contains(sensor, jnp.float32(0), jnp.float32(1)))
-
-
 def test_whole_turns_leave_a_bearing_as_it_is():
     bearings = np.array([-np.pi, -3.0, -0.2, 0.0, 0.2, 1.5, 3.0], np.float32)
     np.testing.assert_array_equal(windows.wrapped(jnp.asarray(bearings)), bearings)
@@ -152,18 +145,3 @@ def test_a_window_with_a_reading_that_is_none_is_not_known(m, reading, is_known)
     assert (bool(found.is_known), bool(found.is_there)) == (is_known, is_known)
     if not is_known:
         np.testing.assert_array_equal(found.features, 0.5)
-
-
-@pytest.mark.parametrize("m", [0, 1])
-def test_a_bearing_of_a_turn_more_is_the_same_look(m):
-    sensor = (CAMERA, LIDAR)[m]
-    rng = np.random.default_rng(0)
-    scan = rng.uniform(0.3, 0.9, SCANS[sensor.name].shape).astype(np.float32)
-    before, after = (
-        MODELS.detect(m, sensor, scan, jnp.float32(b), jnp.float32(0.9)) for b in (0.2, 0.2 + TURN)
-    )
-    assert bool(after.is_known & after.is_there)
-    np.testing.assert_allclose(after.features, before.features, atol=1e-6)
-    beyond = MODELS.detect(m, sensor, scan, jnp.float32(0.2), jnp.float32(1.3))
-    assert not bool(beyond.is_known | beyond.is_there)
-    np.testing.assert_array_equal(beyond.features, 0.5)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Attribute, CameraConfig, Config, LidarConfig, Shape
+from jaxsense.config import ArenaConfig, Attribute, Shape
 from jaxsense.mission import navigation
 from jaxsense.sim import sensors, windows
 
@@ -72,36 +72,6 @@ def test_surfaces_show_the_attributes_of_pois_and_of_everything_else(view):
     for name, temperature in (("poi0_slab", 60), ("poi1_post", 5), ("wall0", 20)):
         assert shown["temperature"][of_geom[name]] == temperature
     np.testing.assert_allclose(shown["colour"][of_geom["poi2_slab"]], [0.9, 0.4, 0.05])
-
-
-def test_a_cylinder_is_as_high_as_all_pois_whatever_its_radius():
-    config = ArenaConfig(poi_radius=0.05)
-    layout = sim.make_layout(config, POSITION, jnp.zeros(3), jnp.array([0, 0, 2]))
-    arena = sim.build(config, (True,))
-    data = jax.jit(sim.place, static_argnums=0)(arena, layout, jnp.array([[-0.5, 0.0, 0.0]]))
-    for height in (0.01, 0.152, 0.19):
-        section = cross_section(arena, data, height, robot=0)
-        hit = cast(section, jnp.array([-0.5, 0.0]), jnp.float32(0.0))
-        assert hit.distance == pytest.approx(0.45, abs=1e-5)
-
-
-def test_a_recorded_scan_is_cut_where_the_simulated_one_is():
-    for sensor in sensors.make(Config(lidar=LidarConfig(stride=2), camera=CameraConfig())):
-        shape = (len(sensor.angles), 3) if sensor.channels == 3 else (len(sensor.angles),)
-        scan = np.random.default_rng(0).uniform(0.0, 2.0, shape)  # float64, as NumPy records
-        for bearing in (-0.9, 0.123, 0.6):
-            rows = windows.window_of(sensor, np.arange(len(scan)), jnp.float32(bearing))
-            expected = np.minimum(scan[np.asarray(rows)], sensor.window_limit).reshape(-1)
-            found = sim.cut_out(sensor, scan, bearing)
-            np.testing.assert_allclose(found, expected.astype(np.float32))
-        with pytest.raises(ValueError, match=f"readings of {sensor.name}"):
-            sim.cut_out(sensor, scan[:-1], 0.0)
-
-
-def test_bearings_are_counted_from_the_heading_to_the_left():
-    pose, place = np.array([1.0, 0.0, np.pi / 2]), np.array([0.0, 0.0])
-    assert sim.bearing(pose, place) == pytest.approx(np.pi / 2, abs=1e-6)
-    assert sim.bearing(pose, np.array([2.0, 1.0])) == pytest.approx(-np.pi / 4, abs=1e-6)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,13 +1,11 @@
 import collections
 import functools
 
-import chex
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from mujoco import mjx
 
 from jaxsense import sim
 from jaxsense.config import LIDAR_HEIGHT, ArenaConfig
@@ -160,152 +158,11 @@ def test_normals_are_those_of_mj_ray_but_at_edges(random_hits):
     np.testing.assert_array_equal(length[geom < 0], 0.0)
 
 
-@pytest.fixture(scope="module")
-def known_scan(scan, known_layout):
-    """Rays at the camera's height in the known layout; the robots stand far off, at (-1, -1)."""
-    poses = jnp.array([[-1.0, -1.0, 0.0], [-1.0, -0.5, 0.0]])
-
-    def cast(origins, angles):
-        num = len(origins)
-        batch = jax.tree.map(lambda x: jnp.repeat(x[None], len(HEIGHTS), 0), (known_layout, poses))
-        pad = RAYS_PER_SCENE - num
-        origins = np.pad(np.array(origins, np.float32), ((0, pad), (0, 0)))
-        angles = np.pad(np.array(angles, np.float32), (0, pad))
-        repeat = [np.repeat(x[None], len(HEIGHTS), 0) for x in (origins, angles)]
-        data, hits = scan(*batch, HEIGHTS, *repeat, robot=-1)
-        return at(data, 0), jax.tree.map(lambda x: np.array(x[0, :num]), hits)
-
-    return cast
-
-
-def test_hand_worked_hits(arena, known_scan):
-    cos, sin = np.cos(np.radians(30)), 0.5
-    cases = [
-        # 0.06 beside the axis of a circle of 0.1: it is met 0.08 before its middle, 0.06^2 + 0.08^2
-        # = 0.1^2, after 1 - 0.08 m, where the normal is (-0.08, 0.06) / 0.1.
-        ((-1.0, 0.06), 0.0, 0.92, "poi0_cylinder", (-0.8, 0.6)),
-        # Straight on to the side of a cube turned by 30 degrees, 0.5 - 0.1 m away.
-        ((0.5 * cos, 1 + 0.5 * sin), np.radians(210), 0.4, "poi1_cube", (cos, sin)),
-        # Along x on to the middle of that cube: its side crosses the ray 0.1 / cos 30 before it.
-        ((-0.5, 1.0), 0.0, 0.5 - 0.1 / cos, "poi1_cube", (-cos, -sin)),
-        # Down on to the wall at y = -1.5.
-        ((0.0, -1.0), -np.pi / 2, 0.5, "wall3", (0.0, 1.0)),
-        # From outside on to the outer side of the same wall, at y = -1.55.
-        ((0.0, -2.0), np.pi / 2, 0.45, "wall3", (0.0, -1.0)),
-        # The next robot's body, 1 - 0.0495 m away.
-        ((-1.0, 0.5), -np.pi / 2, 0.9505, "robot1_body", (0.0, 1.0)),
-    ]
-    origins, angles, distance, names, normal = zip(*cases, strict=True)
-    _, hits = known_scan(origins, angles)
-    np.testing.assert_allclose(hits.distance, distance, atol=2e-6)
-    assert [arena.mj_model.geom(g).name for g in hits.geom] == list(names)
-    np.testing.assert_allclose(np.stack(hits.normal, -1), normal, atol=1e-5)
-
-
-def test_ray_from_inside_a_geom_meets_it_where_it_leaves(arena, known_scan, set_native):
-    cases = [
-        # 0.06 beside the axis of a cylinder of 0.1 and 0.08 behind its middle: a chord of 0.16.
-        ((-0.07, 0.06), 0.0, 0.15),
-        ((0.0, 0.0), 1.0, 0.1),
-        # From the middle of a cube along its diagonal: 0.1 times the square root of 2.
-        ((1.0, -1.0), np.pi / 4, 0.1 * np.sqrt(2.0)),
-        # In the middle of a wall 0.05 thick.
-        ((0.0, 1.525), np.pi / 2, 0.025),
-    ]
-    origins, angles, distance = zip(*cases, strict=True)
-    data, hits = known_scan(origins, angles)
-    np.testing.assert_allclose(hits.distance, distance, atol=1e-5)
-    mj_data = set_native(data)
-    for origin, angle, own, geom in zip(origins, angles, hits.distance, hits.geom, strict=True):
-        expected, expected_geom, _ = native_ray(arena, mj_data, origin, HEIGHTS[0], angle, -1)
-        assert own == pytest.approx(expected, abs=DISTANCE_TOLERANCE)
-        assert geom == expected_geom
-
-
-def test_mjx_ray_sees_through_cylinders_and_cast_does_not(arena, known_scan):
-    # mjx.ray raises TypeError on a model without a material.
-    mj_model = mujoco.MjModel.from_xml_string("""
-        <mujoco>
-          <asset><material name="any"/></asset>
-          <worldbody>
-            <geom type="cylinder" size=".1 .1" pos="0 0 .1"/>
-            <geom type="box" size=".025 1.5 .15" pos="1.525 0 .15"/>
-          </worldbody>
-        </mujoco>""")
-    mj_data = mujoco.MjData(mj_model)
-    mujoco.mj_kinematics(mj_model, mj_data)
-    start, direction = np.array([-0.5, 0.0, HEIGHTS[0]]), np.array([1.0, 0.0, 0.0])
-    geom = np.zeros(1, np.int32)
-    native = mujoco.mj_ray(mj_model, mj_data, start, direction, None, True, -1, geom)
-    assert native == pytest.approx(0.4)  # 0.5 to the axis, less the radius of 0.1
-
-    model = mjx.put_model(mj_model, impl="jax")
-    data = mjx.put_data(mj_model, mj_data, impl="jax")
-    through, _ = jax.jit(mjx.ray)(model, data, jnp.array(start), jnp.array(direction))
-    assert float(through) == pytest.approx(2.0, abs=1e-5)  # the wall at 1.5, behind the cylinder
-
-    _, hits = known_scan([(-0.5, 0.0)], [0.0])
-    assert hits.distance[0] == pytest.approx(0.4, abs=1e-5)
-    assert arena.mj_model.geom(hits.geom[0]).name == "poi0_cylinder"
-
-
-def test_batch_of_rays_equals_a_loop_of_singles(arena, known_scan):
-    angles = np.linspace(-3.0, 3.0, 8, dtype=np.float32)
-    origin = np.float32([-0.4, -0.3])
-    data, batch = known_scan([origin] * len(angles), angles)
-    section = sim.cross_section(arena, data, HEIGHTS[0], -1)
-    cast = jax.jit(sim.cast)
-    for b, angle in enumerate(angles):
-        chex.assert_trees_all_close(at(batch, b), cast(section, origin, angle), atol=1e-5)
-    several = cast(section, origin, angles.reshape(2, 4))
-    assert several.geom.shape == several.distance.shape == (2, 4)
-    chex.assert_trees_all_close(jax.tree.map(lambda x: x.reshape(-1), several), batch, atol=1e-5)
-
-
-def test_wrong_shapes_are_named_while_tracing(arena, place, known_layout):
-    data = place(known_layout, jnp.zeros((2, 3)))
-    section = sim.cross_section(arena, data, 0.1, 0)
-    with pytest.raises(ValueError, match="origin"):
-        jax.eval_shape(sim.cast, section, jnp.zeros(3), jnp.float32(0))
-
-
-def test_a_scene_has_outlines_and_no_more_circles_than_those(arena, place, known_layout):
-    section = sim.cross_section(arena, place(known_layout, jnp.zeros((2, 3))), 0.1, 0)
-    nothing = section.replace(geom=(), num_circles=0)
-    with pytest.raises(ValueError, match=r"number of outlines = 0: must be .* greater than 0"):
-        sim.cast(nothing, np.zeros(2), 0.0)
-    number = len(section.geom)
-    with pytest.raises(ValueError, match=rf"num_circles = {number + 1}: .* from 0 to {number}"):
-        sim.cast(section.replace(num_circles=number + 1), np.zeros(2), 0.0)
-
-
 def test_turned_as_worked_by_hand():
     # A quarter turn to the left takes east to north, and north to west.
     x, y = raycast.turned((jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), jnp.float32(np.pi / 2))
     np.testing.assert_allclose(x, [0.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-6)
-
-
-def test_one_loop_and_two_find_the_same(arena, known_layout, place):
-    """Accelerators use the one and CPUs the other."""
-    data = place(known_layout, jnp.zeros((2, 3)))
-    section = raycast.cross_section(arena, data, 0.152, 0)
-    origins = jax.random.uniform(jax.random.key(0), (200, 2), minval=-1.4, maxval=1.4)
-    angles = jax.random.uniform(jax.random.key(1), (200,), maxval=2 * jnp.pi)
-    directions = jnp.cos(angles), jnp.sin(angles)
-    one, two = (
-        jax.jit(jax.vmap(find, in_axes=(None, 0, 0)))(section, origins, directions)
-        for find in (raycast._nearest_by_one_loop, raycast._nearest_by_two_loops)
-    )
-    np.testing.assert_allclose(one[0], two[0], atol=1e-5)
-    assert np.mean(np.asarray(one[1]) == two[1]) > 0.99  # grazing rays may differ
-    assert len(np.unique(one[1])) > 4
-
-
-@pytest.mark.parametrize("robot", [-2, 2, 3])
-def test_a_robot_that_is_not_there_is_named(arena, robot):
-    with pytest.raises(ValueError, match=f"robot = {robot}: must be -1 or one of the 2 robots"):
-        raycast.cross_section(arena, arena.data, 0.1, robot)
 
 
 def test_a_cross_section_holds_everything_that_is_seen_once(arena):
@@ -315,24 +172,3 @@ def test_a_cross_section_holds_everything_that_is_seen_once(arena):
     walls = [f"wall{w}" for w in range(4)]
     assert sorted(names) == sorted([*pois, *walls, "robot1_body", "robot1_lidar"])
     assert section.num_circles == 4
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "expected"),
-    [
-        ("half", np.ones((1, 2)), r"half has the shape \(1, 2\): must be \(2, 2\)"),
-        ("axis", np.ones(2), r"axis has the shape \(2,\): must be \(2, 2\)"),
-        ("centre", [[2.0, 0.0], [0.0, 0.0]], r"centre = .*: must be an array of shape \(2, 2\)"),
-        ("centre", np.full((2, 2), np.nan), "centre = nan: must be finite"),
-        ("half", np.full((2, 2), -0.5), "half = -0.5: must be 0 or more"),
-        ("axis", np.array([[1.0, 0.0], [2.0, 0.0]]), "length of axis = 2.0: must be 1, also where"),
-    ],
-)
-def test_what_is_no_scene_is_refused(name, value, expected):
-    axis = np.array([[1.0, 0.0], [1.0, 0.0]])
-    scene = sim.CrossSection(2 * axis, axis, np.full((2, 2), 0.5), (7, 3), 1)
-    sim.cast(scene, np.zeros(2), 0.0)
-    with pytest.raises(ValueError, match=expected):
-        sim.cast(scene.replace(**{name: value}), np.zeros(2), 0.0)
-    with pytest.raises(ValueError, match=r"geom = .*: must be a tuple"):
-        scene.replace(geom=np.array([7, 3]))

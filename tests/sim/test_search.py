@@ -1,7 +1,6 @@
 """Windows and distances that a misplaced robot tries, by hand and against the plain window."""
 
 import functools
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +8,11 @@ import numpy as np
 import pytest
 
 from jaxsense import PRESETS
-from jaxsense.config import ConfigError, SearchConfig
+from jaxsense.config import SearchConfig
 from jaxsense.sim import search, sensors, windows
 
 CAMERA, LIDAR = sensors.make(PRESETS["default"])
 BOTH = pytest.mark.parametrize("sensor", [CAMERA, LIDAR], ids=["camera", "lidar"])
-
-
-@BOTH
-def test_who_does_not_search_reads_the_plain_window(sensor):
-    assert search.widened(sensor, SearchConfig()) == sensor
 
 
 def test_a_search_reads_as_many_more_rays_as_its_errors_need():
@@ -99,33 +93,11 @@ def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
     np.testing.assert_array_equal(is_tried, np.arange(len(is_tried)) == len(is_tried) // 2)
 
 
-def test_robots_that_search_keep_away_by_the_error_of_their_position():
-    config = PRESETS["default"]
-
-    def with_errors(position):
-        errors = SearchConfig(position=position)
-        localisation = replace(config.mission.localisation, search=errors)
-        return replace(config, mission=replace(config.mission, localisation=localisation))
-
-    assert with_errors(0.2).mission.localisation.search.applies
-    # .3 m, the nearest look of training, and .21 m are beyond the viewpoints at .5 m.
-    with pytest.raises(ConfigError, match=r"view_distances.*from 0.510 m"):
-        with_errors(0.21)
-
-
 def readings_of(sensor):
     """A scan in which every reading tells its ray, below the limit of a window."""
     number = len(sensor.angles) * sensor.channels
     shape = (len(sensor.angles), *(() if sensor.channels == 1 else (sensor.channels,)))
     return np.linspace(0.1, 0.9, number, dtype=np.float32).reshape(shape)
-
-
-def test_a_sensor_of_one_ray_has_nothing_to_widen():
-    one = PRESETS["default"].lidar
-    config = replace(PRESETS["default"], lidar=replace(one, num_beams=1, window=1))
-    sensor = sensors.make(config)[1]
-    for given in (SearchConfig(), SearchConfig(position=0.09, heading=6.0)):
-        assert search.widened(sensor, given) is sensor
 
 
 def test_small_errors_of_position_try_other_distances_too():

@@ -8,7 +8,7 @@ import pytest
 
 import jaxsense.looks
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, CameraConfig, Config, ConfigError, ViewpointConfig
+from jaxsense.config import ArenaConfig, Config, ConfigError, ViewpointConfig
 from jaxsense.sim import viewpoints, world
 
 CLASSES = jnp.array([0, 1, 2])  # green cylinder, red cylinder, red cube
@@ -135,14 +135,6 @@ def test_look_moves_its_robot_only(looks):
         np.testing.assert_array_equal(scene.light.direction, before.light.direction)
 
 
-def test_look_returns_the_detectors_input(looks):
-    _, _, ((pixels, _), (ranges, _)) = looks
-    assert pixels.shape == (NUM_LOOKS, 3 * 80)
-    assert ranges.shape == (NUM_LOOKS, 128)
-    assert ranges.min() >= 0.08
-    assert ranges.max() == 1.5  # what is further away is cut off
-
-
 def test_look_is_centred_on_the_poi(looks):
     pois, before, ((pixels, _), (ranges, scene)) = looks
     red, green, _ = pixels.reshape(NUM_LOOKS, 80, 3)[:, 39:41].mean(axis=1).T
@@ -169,38 +161,6 @@ def test_surveys_equal_single_ones(simulation, monkeypatch):
         chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
 
 
-@pytest.mark.slow
-def test_looks_at_a_scene_share_what_changes_its_light(simulation):
-    camera = CameraConfig(pixel_noise=0.0, exposure_error=0.5)
-    changing = world.make_world(Config(camera=camera), arena=simulation.arena)
-    assert not simulation.reads_conditions
-    assert changing.reads_conditions
-    key = jax.random.key(3)
-    plain, scene = (jax.jit(sim.random_scene)(key, w, CLASSES) for w in (simulation, changing))
-    assert plain.light.conditions is None
-    unchanged = dataclasses.replace(scene.light, conditions=None)
-    chex.assert_trees_all_equal(dataclasses.replace(scene, light=unchanged), plain)
-
-    @jax.jit
-    def scan(key, pose, seconds):
-        here = dataclasses.replace(scene, poses=scene.poses.at[0].set(pose))
-        data = sim.place(changing.arena, here.layout, here.poses)
-        return world.scan_around(key, changing, here, data, 0, jnp.float32(0), 0, seconds)
-
-    def brightness(seed, seconds=0.0):
-        return np.log(scan(jax.random.key(seed), jnp.array([0.5, 0.0, 0.0]), seconds))
-
-    first, later = brightness(0), brightness(0, 90.0)
-    np.testing.assert_array_equal(brightness(1), first)
-    # .5 m are one unit of distance, and 90 s one and a half of time.
-    values = [scene.light.conditions.at(jnp.array([1.0, 0.0, time])) for time in (0.0, 1.5)]
-    drift = 0.5 * (values[1] - values[0])[0]
-    assert abs(drift) > 0.1
-    within = (first < 0) & (later < 0)  # of the full scale
-    assert within.any()
-    np.testing.assert_allclose((later - first)[within], drift, atol=1e-4)
-
-
 def test_the_world_of_other_settings_keeps_the_arena():
     config = Config()
     made = world.make_world(config)
@@ -223,31 +183,6 @@ def test_the_world_of_other_settings_keeps_the_arena():
         world.make_world(other, arena=made.arena)
 
 
-@pytest.mark.slow
-def test_a_world_is_an_input_of_a_program(simulation):
-    key = jax.random.key(0)
-    survey = jax.jit(world.survey)
-    closed = jax.jit(lambda key: world.survey(key, simulation, CLASSES))(key)
-    chex.assert_trees_all_close(survey(key, simulation, CLASSES), closed, atol=1e-5)
-
-
 def test_an_arena_of_64_bits_is_refused():
     with jax.enable_x64(True), pytest.raises(ConfigError, match="64"):
         sim.make_world(Config())
-
-
-def test_wrong_shapes_are_named_while_tracing(simulation):
-    key = jax.random.key(0)
-    scene = jax.eval_shape(lambda: sim.random_scene(key, simulation, CLASSES))
-    with pytest.raises(ValueError, match="classes"):
-        jax.eval_shape(lambda c: sim.random_scene(key, simulation, c), jnp.zeros(4, jnp.int32))
-    with pytest.raises(ValueError, match="poi"):
-        jax.eval_shape(lambda s, p: sim.look(key, simulation, s, 0, p), scene, CLASSES)
-    with pytest.raises(ValueError, match="others"):
-        jax.eval_shape(
-            lambda layout, others: viewpoints.random_viewpoint(
-                key, ViewpointConfig(), ArenaConfig(), layout, others, jnp.int32(0)
-            ),
-            scene.layout,
-            jnp.zeros(2),
-        )
