@@ -69,7 +69,7 @@ class Live:
           poi: `[]` int32.
           modality: index of the sensor; static.
         """
-        window, scene = worlds.look(key, self.world, scene, modality, poi)
+        (window, _), scene = worlds.look(key, self.world, scene, modality, poi)
         return detectors.detect(self.detectors[modality], window), scene
 
 
@@ -237,9 +237,9 @@ def repeats(
         scene_key, move_key, first_key, *later_keys = jax.random.split(key, 2 + number)
         farthest = jnp.where(jax.random.bernoulli(move_key), _FARTHEST_MOVE, 0.0)
         drawn, poi = worlds.random_scene(scene_key, world, classes, places), jnp.int32(0)
-        first, seen = worlds.look(first_key, world, drawn, modality, poi)
+        (first, _), seen = worlds.look(first_key, world, drawn, modality, poi)
         again = jax.vmap(lambda key: worlds.look_again(key, world, seen, modality, poi, farthest))
-        windows, positions = again(jnp.stack(later_keys))
+        windows, _, positions = again(jnp.stack(later_keys))
         place = seen.poses[modality, :2]
         return (
             jnp.concatenate([first[None], windows]),

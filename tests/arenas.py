@@ -13,7 +13,7 @@ from jaxsense.config import ArenaConfig
 @pytest.fixture(scope="session")
 def arena():
     """An arena without contacts, in which robot 1 carries the laser scanner."""
-    return sim.build(ArenaConfig(), (False, True))
+    return sim.build(ArenaConfig(), (False, True), contacts=False)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import TIMESTEP, ArenaConfig, Shape, require_32_bits
+from jaxsense.config import TIMESTEP, ArenaConfig, Shape
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro
@@ -87,6 +87,7 @@ class Arena:
         return axes.reshape(-1, 3, 3).astype(np.float32)
 
 
+@functools.cache
 def build(
     config: ArenaConfig,
     lidar_robots: tuple[bool, ...],
@@ -101,18 +102,7 @@ def build(
       lidar_robots: for each robot, whether it carries a laser scanner, or another sensor on top.
       contacts: whether robots collide with PoIs, with each other and with the walls.
       obstacles: whether there are PoIs and walls.
-
-    Raises:
-      ConfigError: if JAX computes in 64 bits.
     """
-    require_32_bits()
-    return _built(config, lidar_robots, contacts, obstacles)
-
-
-@functools.cache
-def _built(
-    config: ArenaConfig, lidar_robots: tuple[bool, ...], contacts: bool, obstacles: bool
-) -> Arena:
     mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
     mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
     # By default MJX takes the first device of all processes.

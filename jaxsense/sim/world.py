@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import Config, LocalisationConfig, ViewpointConfig
+from jaxsense.config import Config, LocalisationConfig, ViewpointConfig, require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.sim import absence, localisation, sensors, viewpoints, windows
@@ -74,8 +74,9 @@ def make_world(
 
     Raises:
       ValueError: if `arena` was compiled from other settings than `config.arena`.
-      ConfigError: if a custom sensor is wrong, see `sensors.make`.
+      ConfigError: if a custom sensor is wrong, see `sensors.make`, or JAX computes in 64 bits.
     """
+    require_32_bits()
     if arena is None:
         on_top = sensors.on_top(config, robots or config.modalities)
         arena = arenas.build(config.arena, on_top, contacts=contacts)
@@ -89,7 +90,7 @@ def make_world(
 def random_scene(
     key: Key, world: World, classes: Int[Array, "N"], places: Key | None = None
 ) -> Scene:
-    """Draws a scene with PoIs of given classes at random positions under random light.
+    """Draws a scene under random light, each robot at a random viewpoint of a random PoI.
 
     Args:
       key: random key.
@@ -97,11 +98,7 @@ def random_scene(
       classes: index of each PoI's class in the settings of the arena.
       places: random key of the PoIs' positions and directions, with which several scenes show the
         same PoIs; part of `key` by default.
-
-    Returns:
-      The scene. Each robot stands at a random viewpoint of a random PoI.
     """
-    checks.require_key(key)
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
     place_key = layout_key if places is None else places
     layout = arenas.random_layout(place_key, world.arena.config, classes)
@@ -115,7 +112,7 @@ def random_scene(
 
 def look(
     key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
-) -> tuple[Float[Array, "F"], Scene]:
+) -> tuple[tuple[Float[Array, "F"], Float[Array, ""]], Scene]:
     """Places a robot at a random viewpoint of a PoI, and scans the PoI.
 
     Casts only the rays that it needs; readings have the distribution of those of a whole scan.
@@ -128,25 +125,19 @@ def look(
       poi: index of the PoI.
 
     Returns:
-      The detector's input, and the scene with the robot at its viewpoint.
+      The detector's input and the expected distance of the PoI in metres, and the scene with the
+      robot at its viewpoint.
 
     Raises:
-      ValueError: if there is no such robot or PoI, or a pose is not finite.
+      ValueError: if there is no such robot or PoI.
     """
-    checks.require_key(key)
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
-    checks.require_shape("poi", poi, ())
     checks.require_index("poi", poi, world.arena.config.num_pois)
-    checks.require_finite("scene.poses", scene.poses)
     viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
     others = jnp.delete(scene.poses, robot, axis=0)
     pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
-    bearing, _ = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
-    scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
-    data = arenas.place(world.arena, scene.layout, scene.poses)
-    readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
-    return windows.as_window(world.sensors[robot], readings), scene
+    return _look_from((noise_key, error_key), world, scene, robot, poi, pose, bearing)
 
 
 def look_again(
@@ -156,25 +147,12 @@ def look_again(
     robot: int,
     poi: Int[Array, ""],
     farthest: Float[Array, ""] | float,
-) -> tuple[Float[Array, "F"], Float[Array, "2"]]:
-    """Moves a robot a random distance from its viewpoint of a PoI, often a short one, and scans.
-
-    Args:
-      key: random key.
-      world: the simulation.
-      scene: the scene after `look`.
-      robot: index of the robot and of its modality; static.
-      poi: index of the PoI.
-      farthest: longest distance, in metres.
+) -> tuple[Float[Array, "F"], Float[Array, ""], Float[Array, "2"]]:
+    """`look` from a random distance from the robot's viewpoint, up to `farthest` [m], often little.
 
     Returns:
-      The detector's input, and the robot's position, in metres.
-
-    Raises:
-      ValueError: if there is no such PoI.
+      The detector's input, the expected distance of the PoI, and the robot's position, in metres.
     """
-    checks.require_shape("poi", poi, ())
-    checks.require_index("poi", poi, world.arena.config.num_pois)
     distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
     pose, bearing = viewpoints.moved_viewpoint(
         viewpoint_key,
@@ -186,11 +164,26 @@ def look_again(
         scene.poses[robot, :2],
         farthest * jax.random.uniform(distance_key) ** 3,
     )
-    bearing, _ = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
+    keys = noise_key, error_key
+    (window, distance), _ = _look_from(keys, world, scene, robot, poi, pose, bearing)
+    return window, distance, pose[:2]
+
+
+def _look_from(
+    keys: tuple[Key, Key],
+    world: World,
+    scene: Scene,
+    robot: int,
+    poi: Int[Array, ""],
+    pose: Float[Array, "3"],
+    bearing: Float[Array, ""],
+) -> tuple[tuple[Float[Array, "F"], Float[Array, ""]], Scene]:
+    noise_key, error_key = keys
+    bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
-    return windows.as_window(world.sensors[robot], readings), pose[:2]
+    return (windows.as_window(world.sensors[robot], readings), distance), scene
 
 
 def scan_around(
@@ -204,7 +197,7 @@ def scan_around(
     seconds: Float[Array, ""] | float = 0.0,
     twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "window *channels"]:
-    """Scans around a bearing from a robot's current pose.
+    """Readings of the rays that the detector reads around a bearing, from a robot's current pose.
 
     Args:
       key: random key of the noise.
@@ -212,13 +205,10 @@ def scan_around(
       scene: the scene.
       data: the scene's MJX state, from `place`.
       robot: index of the robot, which may be traced.
-      bearing: bearing of the window's centre in the robot's frame, in radians.
+      bearing: of the window's centre in the robot's frame, in radians.
       modality: index of the robot's sensor; static, because sensors differ in shape.
       seconds: time of the scan, over which the light changes.
       twin: position of one more robot, see `sensors.scan`.
-
-    Returns:
-      The readings of the rays that the detector reads.
     """
     sensor = world.sensors[modality]
     rays, (layout, light) = windows.rays_of(sensor, bearing), (scene.layout, scene.light)
@@ -248,7 +238,6 @@ def survey(
       The scene, for each robot the inputs of its detector, one per PoI, and the expected distances
       of the PoIs, in metres.
     """
-    checks.require_key(key)
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     scene = random_scene(scene_key, world, classes, places)
     robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)

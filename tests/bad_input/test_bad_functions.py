@@ -358,12 +358,6 @@ FUNCTIONS = {
         lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)),
         "poi = 3: must be a whole number from 0 to 2",
     ),
-    "look poses": (
-        lambda w: sim.look(
-            w.key, w.world, dataclasses.replace(w.scene, poses=w.scene.poses * NAN), 0, jnp.int32(0)
-        ),
-        "scene.poses = nan: must be finite",
-    ),
     "cross_section robot": (
         lambda w: sim.cross_section(w.world.arena, w.world.arena.data, 0.1, 5),
         "robot = 5",

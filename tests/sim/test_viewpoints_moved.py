@@ -60,8 +60,8 @@ def test_looks_from_one_place_are_alike_but_for_their_noise():
     def look_twice(key):
         scene_key, first_key, second_key = jax.random.split(key, 3)
         scene = world.random_scene(scene_key, simulation, jnp.array([0, 1, 2]))
-        first, seen = world.look(first_key, simulation, scene, 1, jnp.int32(0))
-        second, place = world.look_again(second_key, simulation, seen, 1, jnp.int32(0), 2.0)
+        (first, _), seen = world.look(first_key, simulation, scene, 1, jnp.int32(0))
+        second, _, place = world.look_again(second_key, simulation, seen, 1, jnp.int32(0), 2.0)
         return first, second, jnp.linalg.norm(place - seen.poses[1, :2])
 
     each = jax.jit(jax.vmap(look_twice))(jax.random.split(jax.random.key(1), 256))

@@ -136,13 +136,14 @@ def test_look_moves_its_robot_only(looks):
 
 
 def test_look_is_centred_on_the_poi(looks):
-    pois, before, ((pixels, _), (ranges, scene)) = looks
+    pois, before, (((pixels, _), _), ((ranges, expected), scene)) = looks
     red, green, _ = pixels.reshape(NUM_LOOKS, 80, 3)[:, 39:41].mean(axis=1).T
     np.testing.assert_array_equal(red > green, np.array(pois) > 0)
     # In the middle of the window is the near side of the PoI: 0.1 to 0.1414 before its centre, and
     # not much farther where the window's bearing is 1 degree off; three deviations of noise.
     target = before.layout.position[range(NUM_LOOKS), pois]
     distance = np.linalg.norm(target - scene.poses[:, 1, :2], axis=-1)
+    np.testing.assert_allclose(expected, distance, rtol=1e-6)
     depth = distance - np.median(ranges[:, 62:66], axis=-1)
     assert depth.min() > 0.1 - 0.03
     assert depth.max() < 0.1415 + 0.03
