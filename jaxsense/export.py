@@ -12,36 +12,225 @@ import json
 import math
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import export
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
-from jaxsense.interfaces.extras import extra
-from jaxsense.interfaces.graph import OPSET, Constants, as_onnx
-from jaxsense.interfaces.onboard import functions
-from jaxsense.interfaces.translate import arrays_of, program
-from jaxsense.mission.memory import MOST_LOOKS
+from jaxsense.core.types import Belief
+from jaxsense.dqn.policies import POLICIES, Known
+from jaxsense.dqn.team_mdp import Team
+from jaxsense.interfaces.common import extra
+from jaxsense.mission import maps, memory
+from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.mission.state import RECENT_LOOKS
-from jaxsense.models import Models
+from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks.pretrained import PREFIX
+from jaxsense.vae import jmvae
+from jaxsense.vae.jmvae import Jmvae
 
 PROGRAM = "jaxsense.export"
+
+Arrays = dict[str, jax.Array]
+Struct = jax.ShapeDtypeStruct
+Function = tuple[Callable[..., Arrays], dict[str, Struct]]
+"""`(models, *inputs) -> {name: output}` for one look or choice, and its inputs by name."""
+
+_POIS, _ROBOTS, _LOOKS = export.symbolic_shape(
+    "pois, robots, looks", constraints=["pois >= 1", "robots >= 1", "looks >= 1"]
+)
+_FRAME = "in one frame of the map that all robots share"
+_MEANING = {
+    "readings": "of all rays of a scan, in the order and unit of `sensors`; resample other scans",
+    "bearing": "of the PoI in the sensor's frame (x ahead, y left), in radians, positive to the "
+    "left",
+    "distance": "expected from the sensor to the PoI's centre, in metres",
+    "is_known": "whether the detector has learned from such looks, see `learned`, and the scan was "
+    "recorded around the bearing; if not, what is there stays open",
+    "is_there": "whether the scan shows the PoI",
+    "detects": "whether it is there and a label is probable enough: only then write the look",
+    "features": "probability of each label, in the order of `labels`; equal if it is not there",
+    "apart": "distances from earlier looks by this sensor at the PoI, in metres; infinite for none",
+    "weight": "share of the look that is new evidence, above 0 and up to 1",
+    "to_go": "metres straight away from the earlier looks to where half of a look is new",
+    "mean": "of the belief about a PoI in the latent space",
+    "std": "standard deviation of that belief, above 0",
+    "seen": "which sensors have looked at it before",
+    "new_mean": "of the new belief",
+    "new_std": "standard deviation of the new belief",
+    "evidence": "logarithm of each class's likelihood given the look, up to a constant",
+    "sums": "sum of the evidence of each robot's own looks at each PoI, from `tell`: the robot's "
+    "own, and the latest that it has received; 0 for no looks",
+    "probabilities": "of each class, in the order of `classes`",
+    "most_likely": "index of the most likely class",
+    "plausible": "which classes the belief leaves open",
+    "looked_from": "places of earlier looks by each sensor at each PoI, infinite for none; x and y "
+    f"in metres, {_FRAME}; robots remember `remembered_looks`",
+    "robot": "index of the robot that chooses",
+    "positions": f"of the PoIs, x and y in metres, {_FRAME}",
+    "present": "PoIs that this robot has not given up",
+    "poses": f"of the robots, x and y in metres and yaw in radians, {_FRAME}",
+    "modality": "index of each robot's sensor in `modalities`",
+    "works": "robots that have neither ended by NOP nor failed",
+    "target": "PoI that each robot heads for, N for none",
+    "action": "PoI to look at next; N for NOP, which ends the robot's part; -1 if a value is not a "
+    "number",
+    "values": "the policy's value of each action, NOP's last; the rules choose among the best",
+}
+"""Of inputs and outputs; those of encoders are features by the name of their sensor."""
+
+
+def functions(config: Config) -> dict[str, Function]:
+    """All functions that a robot needs, by name, see `docs/interfaces.md`."""
+    model, own_maps = make_jmvae(config), config.mission.communication.own_maps
+    found = {"classify": _classify(config), "decide": _decide(config)}
+    for m, name in enumerate(model.modalities):
+        found |= {f"detect_{name}": _detect(config, m), f"weigh_{name}": _weigh(m)}
+        found |= {f"tell_{name}" if own_maps else f"write_{name}": _write(config, m, own_maps)}
+    if own_maps:
+        found["merge"] = _merge, {"sums": _real(_ROBOTS, _POIS, len(config.arena.classes))}
+    for subset in () if config.jmvae.reads_scans else model.subsets:
+        found[f"encode_{model.encoder_name(subset)}"] = _encode(model, subset)
+    return found
+
+
+def _real(*shape: Any) -> Struct:
+    return Struct(shape, jnp.float32)
+
+
+def _detect(config: Config, m: int) -> Function:
+    sensor, mission = sensors.make(config)[m], config.mission
+
+    def detect(
+        models: Models, readings: jax.Array, bearing: jax.Array, distance: jax.Array
+    ) -> Arrays:
+        """What a look says."""
+        search = mission.localisation.search
+        found = models.detect(m, sensor, readings, bearing, distance, search)
+        is_confident = jnp.max(found.features) >= mission.least_confidence
+        return {**vars(found), "detects": found.is_there & is_confident}
+
+    return detect, {"readings": _real(*sensor.shape), "bearing": _real(), "distance": _real()}
+
+
+def _weigh(m: int) -> Function:
+    def weigh(models: Models, apart: jax.Array) -> Arrays:
+        """How much of a look is new after earlier ones."""
+        novelty = models.novelty
+        return {"weight": novelty.weight(apart, m), "to_go": novelty.to_go(apart, m)}
+
+    return weigh, {"apart": _real(_LOOKS)}
+
+
+def _write(config: Config, m: int, own_maps: bool) -> Function:
+    def tell(models: Models, features: jax.Array, weight: jax.Array) -> Arrays:
+        """The evidence of a look, for the sum of a robot's own looks."""
+        return {"evidence": maps.log_likelihood(models, features, m, weight)}
+
+    def write(
+        models: Models, mean: jax.Array, std: jax.Array, seen: jax.Array, *look: jax.Array
+    ) -> Arrays:
+        """The belief about a PoI after a look."""
+        features, weight = look
+        after = models.fusion.update(Belief(mean, std), seen, features, m, weight)
+        return {"new_mean": after.mean, "new_std": after.std}
+
+    model = make_jmvae(config)
+    look = {"features": _real(model.feature_sizes[m]), "weight": _real()}
+    if own_maps:
+        return tell, look
+    before = {"mean": _real(model.latent_size), "std": _real(model.latent_size)}
+    return write, {**before, "seen": Struct((len(model.modalities),), bool), **look}
+
+
+def _merge(models: Models, sums: jax.Array) -> Arrays:
+    """A robot's map, from what each robot has said of its own looks."""
+    of_poi = jax.vmap(lambda total: memory.belief_of(models.fusion, total))
+    return vars(of_poi(jnp.sum(sums, axis=0)))
+
+
+def _encode(model: Jmvae, subset: tuple[int, ...]) -> Function:
+    def encode(models: Models, *features: jax.Array) -> Arrays:
+        """The JMVAE's belief after a look by each of these."""
+        given = dict(zip(subset, features, strict=True))
+        of_each = tuple(given.get(m) for m in range(len(model.modalities)))
+        return vars(jmvae.posterior(models.jmvae, model, of_each))
+
+    return encode, {model.modalities[m]: _real(model.feature_sizes[m]) for m in subset}
+
+
+def _classify(config: Config) -> Function:
+    def classify(models: Models, *belief: jax.Array) -> Arrays:
+        """What the map says about the classes."""
+        read = Belief(*belief)
+        probabilities = jax.vmap(models.fusion.class_probabilities)(read)
+        return {
+            "probabilities": probabilities,
+            "most_likely": jnp.argmax(probabilities, axis=1).astype(jnp.int32),
+            "plausible": jax.vmap(models.plausible_classes)(read),
+        }
+
+    of_pois = _real(_POIS, config.jmvae.latent_size)
+    return classify, {"mean": of_pois, "std": of_pois}
+
+
+def _decide(config: Config) -> Function:
+    key = jax.random.key(0)  # the policy draws nothing
+    modalities, classes = len(config.modalities), len(config.arena.classes)
+
+    def decide(
+        models: Models,
+        mean: jax.Array,
+        std: jax.Array,
+        looked_from: jax.Array,
+        robot: jax.Array,
+        *of_team: jax.Array,
+    ) -> Arrays:
+        """The robot's choice, by its policy and the rules of missions."""
+        team = Team(*of_team)
+        ways = team.poses[:, None, None, :2] - jnp.swapaxes(looked_from, 0, 1)[team.modality]
+        apart = jnp.linalg.norm(ways, axis=-1)
+        known = Known(
+            belief=Belief(mean, std),
+            # The policy of a run reads neither.
+            looks=jnp.zeros((mean.shape[0], modalities), jnp.int32),
+            log_posterior=jnp.zeros((mean.shape[0], classes)),
+            team=team,
+            times=times_to_new_looks(config.team.travel, models.novelty, team, apart),
+            robot=robot,
+        )
+        opinion = ask(key, POLICIES["latent"], models, known)
+        return {"action": choose(config.mission, opinion, known), "values": opinion.values}
+
+    pois = config.arena.num_pois
+    pois = _POIS if make_agent(config).plays(pois + 1) else pois
+    return decide, {
+        "mean": _real(pois, config.jmvae.latent_size),
+        "std": _real(pois, config.jmvae.latent_size),
+        "looked_from": _real(pois, modalities, _LOOKS, 2),
+        "robot": Struct((), jnp.int32),
+        "positions": _real(pois, 2),
+        "present": Struct((pois,), bool),
+        "poses": _real(_ROBOTS, 3),
+        "modality": Struct((_ROBOTS,), jnp.int32),
+        "works": Struct((_ROBOTS,), bool),
+        "target": Struct((_ROBOTS,), jnp.int32),
+    }
 
 
 def archive(config: Config, models: Models) -> bytes:
     """Returns the content of the file.
-
-    Args:
-      config: settings of the run.
-      models: its trained models.
 
     Raises:
       ModuleNotFoundError: if the extra `export` is not installed.
@@ -49,29 +238,29 @@ def archive(config: Config, models: Models) -> bytes:
       ValueError: if the archive is larger than `robot.load` reads.
     """
     with extra("export"):
-        from jaxsense.interfaces import robot  # noqa: PLC0415
-    content, described, constants = io.BytesIO(), {}, Constants(arrays_of(models))
+        from jaxsense.interfaces import robot, translate  # noqa: PLC0415
+    content, programs = io.BytesIO(), {}
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as files:
-        for name, function in functions(config).items():
-            inputs = {key: (each.dtype, each.shape) for key, each in function.inputs.items()}
-            found = program(function.apply, models, inputs, constants)
-            onnx = as_onnx(name, function.about, found.graph, constants.arrays, found.outputs)
+        for name, (apply, inputs) in functions(config).items():
+            onnx, outputs = translate.program(name, apply, models, inputs)
             files.writestr(f"{name}.onnx", onnx)
-            described[name] = {
-                "about": function.about,
-                "inputs": {
-                    key: _described(*inputs[key], each.about)
-                    for key, each in function.inputs.items()
-                },
-                "outputs": {
-                    key: _described(*each, function.outputs[key])
-                    for key, each in found.outputs.items()
-                },
-            }
-        contents = json.dumps({**_description(config, models), "programs": described}, indent=2)
+            ends = {"inputs": _described(inputs), "outputs": _described(outputs)}
+            programs[name] = {"about": apply.__doc__, **ends}
+        contents = json.dumps({**_description(config, models), "programs": programs}, indent=2)
         files.writestr("contents.json", contents + "\n")
     robot.load(content)  # a robot, far away, would only see that it cannot
     return content.getvalue()
+
+
+def _described(arrays: dict[str, Struct]) -> dict[str, dict[str, object]]:
+    return {
+        name: {
+            "shape": [n if isinstance(n, int) else str(n) for n in array.shape],
+            "dtype": array.dtype.name,
+            "about": _MEANING.get(name, "features, from its `detect`"),
+        }
+        for name, array in arrays.items()
+    }
 
 
 def _description(config: Config, models: Models) -> dict[str, object]:
@@ -104,8 +293,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
             "centre, in metres, and the largest bearing to either side, in radians",
         },
         "mission": {"attempts": int(mission.attempts), "redecides": bool(mission.redecides)},
-        "remembered_looks": MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
-        "opset": OPSET,
+        "remembered_looks": memory.MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
         "versions": {"jaxsense": __version__},
     }
 
@@ -114,16 +302,11 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
     """How a scan is given to `detect`."""
     rays = min((sensor.window - 1) * sensor.stride, len(sensor.angles) - 1)
     first = (len(sensor.angles) - 1 - rays) // 2
-    last = first + rays
     return {
-        "readings": "distances in metres, infinite or 0 for none"
-        if sensor.measures_distance
-        else "linear RGB from 0 to 1"
-        if sensor.channels == 3
-        else "readings",
+        "readings": _unit(sensor),
         "angles": [round(float(angle), 6) for angle in sensor.angles],
         "height": float(sensor.height),
-        "window": round(float(abs(sensor.angles[last] - sensor.angles[first])), 6),
+        "window": round(float(abs(sensor.angles[first + rays] - sensor.angles[first])), 6),
         "about": "one reading for each ray; `angles` are the rays' directions in the sensor's "
         "frame (x ahead, y left), in radians, positive to the left; `height` is that of the rays "
         "above the floor, in metres; `window` is how wide a part of the scan the detector reads, "
@@ -131,9 +314,10 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
     }
 
 
-def _described(dtype: str, shape: tuple[int | str, ...], about: str) -> dict[str, object]:
-    """An array, with the names of axes of any size, such as "pois"."""
-    return {"shape": shape, "dtype": dtype, "about": about}
+def _unit(sensor: Sensor) -> str:
+    if sensor.measures_distance:
+        return "distances in metres, infinite or 0 for none"
+    return "linear RGB from 0 to 1" if sensor.channels == 3 else "readings"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,9 +343,6 @@ def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
     Args:
       run: its directory, `latest`, or `pretrained:PRESET`.
       trust: whether to run the code of custom sensors.
-
-    Raises:
-      ConfigError: if there is no such run, or no such models.
     """
     if (given := str(run)).startswith(PREFIX) and not run.exists():
         return *rundir.load(run), Path(f"{given.removeprefix(PREFIX)}.zip")

@@ -24,12 +24,6 @@ def run(path, directory, monkeypatch):
     return names
 
 
-def test_all_notebooks_are_tested():
-    assert {path.stem for path in NOTEBOOKS} == {
-        "jmvae_and_fusion", "single_functions", "tasks", "your_robot",
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_store_no_output(path):
     content = json.loads(path.read_text(encoding="utf-8"))

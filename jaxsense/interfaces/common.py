@@ -1,39 +1,40 @@
-"""Spaces and starts, shared by the interfaces."""
+"""What the interfaces share: imports of extras, spaces, starts, and robots of a team."""
 
-import enum
+import contextlib
 import os
-from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxsense.config import Config, ConfigError, names_of_robots
 from jaxsense.core import checks
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, pytree
+from jaxsense.dqn import team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.tasks.environment import Environment, OneAgent
+from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.tasks import make
+from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
+from jaxsense.tasks.task import TeamTask
 
-E = TypeVar("E", bound=enum.Enum)
-B_co = TypeVar("B_co", covariant=True)
-D_co = TypeVar("D_co", covariant=True)
-
-
-class Spaces(Protocol[B_co, D_co]):
-    """Another library's module of spaces."""
-
-    @property
-    def Box(self) -> Callable[..., B_co]:  # noqa: N802
-        """Of an array of numbers within bounds."""
-        ...
-
-    @property
-    def Discrete(self) -> Callable[..., D_co]:  # noqa: N802
-        """Of a number of actions."""
-        ...
-
+T = TypeVar("T")
 
 _processes: set[int] = set()  # in which environments were made: this one and those it forked from
+
+
+@contextlib.contextmanager
+def extra(name: str) -> Iterator[None]:
+    """Names the extra of jaxsense that installs a package whose import fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or name).partition(".")[0]
+        message = f"{package} is not installed: pip install 'jaxsense[{name}]'"
+        raise ModuleNotFoundError(message, name=package) from None
 
 
 def enter_process() -> None:
@@ -42,25 +43,14 @@ def enter_process() -> None:
 
 
 def require_own_process() -> None:
-    """Raises `RuntimeError` if this process was forked from one that has made an environment.
-
-    Programs of JAX hang there.
-    """
+    """Raises `RuntimeError` in a fork of a process with environments, where JAX hangs."""
     if _processes - {os.getpid()}:
         advice = "start processes with spawn, as vector_kwargs={'context': 'spawn'} does"
         raise RuntimeError(f"this process was forked from one that uses JAX: {advice}")
 
 
 def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
-    """What an interface of one agent plays.
-
-    Args:
-      mdp: a task, see `jaxsense.make`, or the map MDP of one agent, see `jaxsense.make_mdp`.
-      modality: index of the agent's own sensor; only with an MDP.
-
-    Raises:
-      ValueError: if there is no such sensor, or a task has one already.
-    """
+    """A task as it is, or the map MDP of the agent whose sensor has the index `modality`."""
     if isinstance(mdp, MapMdp):
         checks.require_index("modality", modality, mdp.num_modalities)
         return OneAgent(mdp, modality)  # pyright: ignore[reportArgumentType]
@@ -69,43 +59,11 @@ def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
     return mdp
 
 
-def spaces_of(
-    spaces: Spaces[B_co, D_co], size: int, num_actions: int, bound: float
-) -> tuple[B_co, D_co]:
-    """Spaces of observations and of actions.
-
-    Args:
-      spaces: another library's module.
-      size: numbers in an observation.
-      num_actions: a look at each PoI, and NOP.
-      bound: observations are within plus and minus this.
-    """
-    return spaces.Box(-bound, bound, (size,), np.float32), spaces.Discrete(num_actions)
-
-
-def environment_spaces(spaces: Spaces[B_co, D_co], played: Environment) -> tuple[B_co, D_co]:
-    """Spaces of an environment of one policy, see `spaces_of`.
-
-    Args:
-      spaces: another library's module.
-      played: the environment.
-    """
-    return spaces_of(spaces, played.observation_size, played.num_actions, played.bound)
-
-
 def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
-    """Draws random states, `[number]`, for episodes to start from.
+    """Random states, `[number]`, of a task or a map MDP, for episodes to start from.
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.
-
-    Args:
-      key: random key.
-      mdp: a task or a map MDP.
-      number: of states.
-
-    Raises:
-      ValueError: if `number` is not positive.
     """
     checks.require_number("number of starts", number)
     # A start is the same for all sensors.
@@ -115,34 +73,121 @@ def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
 
 
 def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, " S"], PyTree]:
-    """Starts an episode.
-
-    Args:
-      key: random key.
-      played: the environment.
-      starts: `[S]` from `prepared_starts`, to pick a random one; None for a new start.
-
-    Returns:
-      `[S]` observation, and the state.
-    """
+    """Observation and state: one of `starts` at random, or a new one if they are None."""
     if starts is None:
         return played.reset(key)
-    rows = len(jax.tree.leaves(starts)[0])
-    row = jax.random.randint(key, (), 0, rows)
+    row = jax.random.randint(key, (), 0, len(jax.tree.leaves(starts)[0]))
     state = jax.tree.map(lambda x: x[row], starts)
     return played.observe(state), state
 
 
-def member(name: str, kind: type[E], value: object) -> E:
-    """A member of an enumeration, by its value or as it is; raises `ValueError` if it is none."""
-    known = {each.value: each for each in kind}
-    if value not in (*known, *kind):
-        raise ValueError(f"{name} = {value!r}: must be one of {', '.join(map(str, known))}")
-    return value if isinstance(value, kind) else known[value]
+@pytree
+class Robots:
+    """A team, each robot of which is an agent.
+
+    Robots take turns. In each step one robot chooses, and the actions of the others are ignored.
+    Action n < N heads for PoI n, and action N is NOP, after which the robot is done. If nobody else
+    has to choose, time passes until the next look. The robot that has looked earns the reward of
+    its look and chooses next; each robot that works pays for the time that passed.
+
+    Attributes:
+      mdp: the MDP.
+      sensors: `[R]` int32 index of each robot's sensor.
+      scaling: of observations; None for those of `team_mdp.observation`.
+      names: of the robots.
+      modality: names of their sensors.
+    """
+
+    mdp: TeamMdp
+    sensors: jax.Array
+    scaling: Scaling | None
+    names: tuple[str, ...] = struct.field(pytree_node=False)
+    modality: tuple[str, ...] = struct.field(pytree_node=False)
+
+    @property
+    def observation_size(self) -> int:
+        """S."""
+        return self.mdp.num_features * self.mdp.map.num_pois
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.map.num_pois + 1
+
+    @property
+    def bound(self) -> float:
+        """Observations are within plus and minus this."""
+        return float("inf") if self.scaling is None else self.scaling.bound
+
+    def named(self, of_robots: Iterable[T]) -> dict[str, T]:
+        """`[R, ...]` by the names of the robots."""
+        return dict(zip(self.names, of_robots, strict=True))
+
+    def reset(self, key: Key) -> TeamState:
+        """Starts an episode of all robots."""
+        return team_mdp.reset(key, self.mdp, self.sensors)
+
+    def observe(self, state: TeamState) -> Float[Array, "R S"]:
+        """What each robot knows."""
+
+        def observation(robot: jax.Array) -> jax.Array:
+            features = self.mdp.observe(state, robot)
+            return features.reshape(-1) if self.scaling is None else self.scaling(features.T)
+
+        return jax.vmap(observation)(jnp.arange(len(self.names)))
+
+    def action_mask(self, state: TeamState) -> Bool[Array, "R A"]:
+        """Actions of each robot: the PoIs that are present, if it is its turn, and NOP."""
+        chooses = state.team.works & (jnp.arange(len(self.names)) == state.agent)
+        return (chooses[:, None] & team_mdp.action_mask(state)[None]).at[:, -1].set(True)
+
+    def step(
+        self, key: Key, state: TeamState, actions: Int[Array, " R"]
+    ) -> tuple[TeamState, TimeStep, Float[Array, ""]]:
+        """Lets the robot choose whose turn it is; a PoI that is not present counts as NOP.
+
+        Traced actions that do not exist are not refused: they have a reward of NaN.
+
+        Returns:
+          The state; for each robot its observation, its reward, whether it chose NOP, and whether
+          it would go on at the limit; and the seconds that passed.
+        """
+        checks.require_index("actions", actions, self.num_actions)
+        action = team_mdp.existing(state, actions[state.agent])
+        after, outcome = team_mdp.step(key, self.mdp, state, action)
+        works, seconds = after.team.works, jnp.asarray(outcome.seconds)
+        price = jnp.where(works, self.mdp.config.second_cost * seconds, 0.0)
+        earned = jnp.where(jnp.arange(len(self.names)) == after.agent, outcome.reward, 0.0)
+        found = TimeStep(self.observe(after), earned - price, ~works, works & outcome.truncated)
+        return after, found, seconds
 
 
-def checked_mode(mode: str | None, modes: Sequence[str]) -> str | None:
-    """A mode to render in, one of some; raises `ValueError` if it is another."""
-    if mode not in (None, *modes):
-        raise ValueError(f"render_mode = {mode!r}: must be {' or '.join([*modes, 'None'])}")
-    return mode
+def robots_of(mdp: TeamMdp | TeamTask | str, config: Config | None = None) -> Robots:
+    """Robots of a task, or of its name; or of the MDP of a team, with the settings that name them.
+
+    Raises:
+      ConfigError: if there is no such task, or it is not of a team.
+      ValueError: if the MDP is not that of a team with the sensors of the settings.
+    """
+    played = make(mdp) if isinstance(mdp, str) else mdp
+    if isinstance(mdp, str) and not isinstance(played, TeamTask):
+        raise ConfigError("name", mdp, "must be a task of a team, such as team-v0")
+    if isinstance(played, TeamTask):
+        if config is not None:
+            raise ValueError("config: must be None with a task, which has its robots")
+        modality = tuple(played.mdp.modalities[m] for m in played.robots.tolist())
+        names = names_of_robots(modality)
+        return Robots(played.mdp, played.robots, played.scaling, names, modality)
+    if config is None or played.modalities != config.modalities:
+        sensors = None if config is None else config.modalities
+        made = f"must be a TeamMdp with {sensors}, from jaxsense.make_mdp with dqn.task = 'team'"
+        raise ValueError(f"mdp = {type(played).__name__} with {played.modalities}: {made}")
+    sensors = jnp.array(config.modality_of_robot, jnp.int32)
+    return Robots(played, sensors, None, config.robot_names, config.carried)  # pyright: ignore
+
+
+def spaces_of(spaces: Any, played: Environment | Robots) -> tuple[Any, Any]:
+    """Another library's spaces of an observation, and of an action."""
+    shape = (played.observation_size,)
+    box = spaces.Box(-played.bound, played.bound, shape, np.float32)
+    return box, spaces.Discrete(played.num_actions)

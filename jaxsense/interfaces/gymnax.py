@@ -13,10 +13,9 @@ from jaxtyping import PyTree
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.interfaces import common
-from jaxsense.interfaces.extras import extra
 from jaxsense.tasks import Environment, make, registered
 
-with extra("gymnax"):
+with common.extra("gymnax"):
     from gymnax import register, registered_envs  # pyright: ignore[reportMissingImports]
     from gymnax.environments import environment, spaces  # pyright: ignore[reportMissingImports]
 
@@ -37,7 +36,7 @@ class MapEnvState(environment.EnvState):
 
 @pytree  # pyright: ignore[reportGeneralTypeIssues]
 class MapEnvParams(environment.EnvParams):
-    """Parameters of `MapEnv`: length of episodes, and prepared starts.
+    """Parameters of `MapEnv`.
 
     Attributes:
       max_steps_in_episode: actions after which an episode is truncated.
@@ -52,8 +51,7 @@ class MapEnvParams(environment.EnvParams):
 class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     """A task, or the map MDP of one agent, as an environment of gymnax 1.x.
 
-    One policy chooses, for a team for the robot whose turn it is. Observations of the map MDP are
-    the `[N * 2D]` map, see `dqn.observation`. Action n < N looks at PoI n; action N is NOP.
+    Observations and actions are those of `jaxsense.interfaces.gymnasium.MapVectorEnv`.
     `action_mask` in the infos, `[N + 1]` bool, are the actions that exist after the step, before
     the next episode. The methods are gymnax's.
     """
@@ -64,9 +62,6 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         Args:
           mdp: a task from `jaxsense.make`, or the MDP of one agent, see `jaxsense.make_mdp`.
           modality: index of the agent's own sensor; only with an MDP.
-
-        Raises:
-          ValueError: if there is no such sensor.
         """
         self.played = common.environment(mdp, modality)
 
@@ -76,86 +71,42 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return MapEnvParams(max_steps_in_episode=self.played.max_steps)
 
     def prepared_params(self, key: Key, number: int) -> MapEnvParams:
-        """Default parameters with prepared starts, which make training far faster.
-
-        Args:
-          key: random key.
-          number: of starts.
-        """
+        """Default parameters with prepared starts, which make training far faster."""
         starts = common.prepared_starts(key, self.played, number)
         return self.default_params.replace(starts=starts)  # pyright: ignore
 
     def reset_env(self, key: Key, params: MapEnvParams) -> tuple[jax.Array, MapEnvState]:
-        """Starts an episode.
-
-        Args:
-          key: random key.
-          params: of the environment.
-        """
+        """Starts an episode."""
         seen, start = common.start(key, self.played, params.starts)
         return seen, MapEnvState(time=jnp.int32(0), map=start, terminated=jnp.bool_(False))  # pyright: ignore
 
     def step_env(
         self, key: Key, state: MapEnvState, action: ArrayLike, params: MapEnvParams
     ) -> tuple[jax.Array, MapEnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action, without a reset.
-
-        Args:
-          key: random key.
-          state: the current state.
-          action: `[]` integer, a PoI or N for NOP.
-          params: of the environment.
-
-        Returns:
-          Observation, state, reward, whether NOP has ended the episode, and info.
-
-        Raises:
-          ValueError: if the action is no integer, or does not exist and is not traced.
-        """
+        """Takes one action, without a reset."""
         after, found = self.played.step(key, state.map, jnp.asarray(action))
         state = MapEnvState(time=state.time + 1, map=after, terminated=found.terminated)  # pyright: ignore
         info = {"discount": self.discount(state, params), "action_mask": self.action_mask(state)}
         return found.observation, state, found.reward, found.terminated, info
 
     def action_mask(self, state: MapEnvState) -> jax.Array:
-        """`[N + 1]` bool, the actions that exist.
-
-        Args:
-          state: the current state.
-        """
+        """`[N + 1]` bool, the actions that exist."""
         return self.played.action_mask(state.map)
 
     def observe(
         self, key: Key, state: MapEnvState, action: ArrayLike | None, params: MapEnvParams
     ) -> jax.Array:
-        """What the policy sees of a state.
-
-        Args:
-          key: not used.
-          state: the current state.
-          action: not used.
-          params: not used.
-        """
+        """What the policy sees of a state."""
         del key, action, params
         return self.played.observe(state.map)
 
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """Whether the last action was NOP, `[]` bool.
-
-        Args:
-          state: the current state.
-          params: not used.
-        """
+        """Whether the last action was NOP, `[]` bool."""
         del params
         return state.terminated
 
     def is_truncated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
-        """Whether the episode reached its limit without NOP, `[]` bool.
-
-        Args:
-          state: the current state.
-          params: of the environment.
-        """
+        """Whether the episode reached its limit without NOP, `[]` bool."""
         return ~state.terminated & (state.time >= params.max_steps_in_episode)
 
     @property
@@ -165,32 +116,24 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
 
     @property
     def num_actions(self) -> int:
-        """Number of actions: a look at each PoI, and NOP."""
+        """A look at each PoI, and NOP."""
         return self.played.num_actions
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
-        """Space of the actions: a look at each PoI, and NOP."""
+        """Space of the actions."""
         del params
-        return common.environment_spaces(spaces, self.played)[1]
+        return common.spaces_of(spaces, self.played)[1]
 
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
         """Space of the observations."""
         del params
-        return common.environment_spaces(spaces, self.played)[0]
+        return common.spaces_of(spaces, self.played)[0]
 
 
 # gymnax makes environments static: two of the same task would compile everything twice.
 @functools.cache
 def make_env(name: str, agent: str | None = None) -> MapEnv:
-    """Makes the environment of a task, see `jaxsense.make`; the same one in every call.
-
-    Args:
-      name: of the task.
-      agent: whose sensor looks.
-
-    Raises:
-      ConfigError: if there is no such task or agent.
-    """
+    """The environment of a task, see `jaxsense.make`; the same one in every call."""
     return MapEnv(make(name, agent))
 
 

@@ -4,20 +4,26 @@
 """
 
 import functools
+import sys
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 
 from jaxsense.config import Config
-from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.interfaces import team
-from jaxsense.interfaces.extras import extra, quietly
+from jaxsense.interfaces import common
 from jaxsense.tasks.task import TeamTask
 
-with extra("jaxmarl"), quietly():
+# Its import prints, and sets `sys.stdout` to `sys.__stdout__`, which is not where notebooks print.
+with (
+    common.extra("jaxmarl"),
+    mock.patch.multiple(sys, stdout=sys.stderr, __stdout__=sys.stderr, stderr=sys.stderr),
+):
     from jaxmarl.environments import multi_agent_env, spaces  # pyright: ignore[reportMissingImports]
+
+OfRobots = dict[str, jax.Array]
 
 
 @pytree  # pyright: ignore[reportGeneralTypeIssues]
@@ -36,79 +42,57 @@ class TeamEnvState(multi_agent_env.State):
 class TeamEnv(multi_agent_env.MultiAgentEnv):
     """A task of a team, or the team MDP, as a `MultiAgentEnv`: each robot is an agent.
 
-    Robots take turns, see `jaxsense.interfaces.team`. The methods are jaxmarl's.
+    Robots take turns, see `jaxsense.interfaces.common.Robots`. A robot is done after NOP, and all
+    are at the limit; `__all__` is whether the episode is over. `seconds` in the infos, `[R]` and
+    the same for all, is the duration of the step. The methods are jaxmarl's.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | TeamTask | str, config: Config | None = None):
         """Makes the environment.
 
         Args:
-          mdp: a task of a team from `jaxsense.make`, or the MDP of one, see `jaxsense.make_mdp`.
+          mdp: a task of a team from `jaxsense.make`, or its name; or the MDP of a team, see
+            `jaxsense.make_mdp`.
           config: the settings, which name the robots; only with an MDP.
-
-        Raises:
-          ValueError: if the MDP has other sensors than the settings.
         """
-        self.robots = team.robots_of(mdp, config)
+        self.robots = common.robots_of(mdp, config)
         super().__init__(len(self.robots.names))
         self.agents = list(self.robots.names)
-        self.observation_spaces, self.action_spaces = self.robots.spaces(spaces)
+        of_each = (dict.fromkeys(self.agents, x) for x in common.spaces_of(spaces, self.robots))
+        self.observation_spaces, self.action_spaces = of_each
 
     # jaxmarl makes the environment static, here as in its `step`, and with it the MDP.
     @functools.partial(jax.jit, static_argnums=0)
-    def reset(self, key: Key) -> tuple[dict[str, jax.Array], TeamEnvState]:
+    def reset(self, key: Key) -> tuple[OfRobots, TeamEnvState]:
         """Starts an episode."""
-        start = self.robots.start(key)
+        start = self.robots.reset(key)
         state = TeamEnvState(done=jnp.bool_(False), step=start.map.steps, team=start)  # pyright: ignore
         return self.get_obs(state), state
 
     def step_env(  # pyright: ignore
-        self, key: Key, state: TeamEnvState, actions: dict[str, jax.Array]
-    ) -> tuple[
-        dict[str, jax.Array],
-        TeamEnvState,
-        dict[str, jax.Array],
-        dict[str, jax.Array],
-        dict[str, jax.Array],
-    ]:
-        """Takes one step, without a reset.
-
-        Args:
-          key: random key.
-          state: the current state.
-          actions: of all robots; only that of the robot whose turn it is counts.
-
-        Returns:
-          Observations, state, rewards, dones and infos. A robot is done after NOP, and all are at
-          the limit; `__all__` is whether the episode is over. `seconds`, `[R]` and the same for
-          all, is the duration of the step.
-
-        Raises:
-          ValueError: if a robot has no action, or if an action is no integer, or does not exist and
-            is not traced.
-        """
-        checks.require_type("actions", actions, dict, f"with one of each of {self.agents}")
+        self, key: Key, state: TeamEnvState, actions: OfRobots
+    ) -> tuple[OfRobots, TeamEnvState, OfRobots, OfRobots, OfRobots]:
+        """Takes one step, without a reset; only the action of the robot whose turn it is counts."""
         if not set(self.agents) <= set(actions):
-            raise ValueError(
-                f"actions of {sorted(actions)}: must have one of each of {self.agents}"
-            )
+            raise ValueError(f"actions = {actions}: must have one of each of {self.agents}")
         chosen = jnp.stack([jnp.asarray(actions[agent]) for agent in self.agents])
-        after, outcome = team.step(key, self.robots.mdp, state.team, chosen)
-        dones = outcome.terminated | outcome.truncated
+        after, found, seconds = self.robots.step(key, state.team, chosen)
+        dones = found.terminated | found.truncated
         ended = jnp.all(dones)
         state = TeamEnvState(done=ended, step=after.map.steps, team=after)  # pyright: ignore
-        infos = {"seconds": jnp.full(self.num_agents, outcome.seconds)}
-        of_each = {**self.robots.named(dones), "__all__": ended}
-        return self.get_obs(state), state, self.robots.named(outcome.rewards), of_each, infos
+        infos = {"seconds": jnp.full(self.num_agents, seconds)}
+        named = self.robots.named
+        of_each = {**named(dones), "__all__": ended}
+        return named(found.observation), state, named(found.reward), of_each, infos
 
-    def get_obs(self, state: TeamEnvState) -> dict[str, jax.Array]:  # pyright: ignore
+    def get_obs(self, state: TeamEnvState) -> OfRobots:  # pyright: ignore
         """Observation of each robot, `[S]`, see `team_mdp.observation`."""
-        return self.robots.named(self.robots.observations(state.team))
+        return self.robots.named(self.robots.observe(state.team))
 
     @functools.partial(jax.jit, static_argnums=0)
-    def get_avail_actions(self, state: TeamEnvState) -> dict[str, jax.Array]:
+    def get_avail_actions(self, state: TeamEnvState) -> OfRobots:
         """Actions that each robot has, `[N + 1]` bool: only NOP if it is not its turn."""
-        return self.robots.named(team.available(state.team))
+        return self.robots.named(self.robots.action_mask(state.team))
 
     @property
     def name(self) -> str:
@@ -126,12 +110,5 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
 
 @functools.cache  # jaxmarl makes environments static, see `TeamEnv`
 def make(name: str) -> TeamEnv:
-    """Makes the environment of a task, see `jaxsense.make`; the same one in every call.
-
-    Args:
-      name: of the task.
-
-    Raises:
-      ConfigError: if there is no such task, or it is not of a team.
-    """
-    return TeamEnv(team.team_task(name))
+    """The environment of a task of a team, see `jaxsense.make`; the same one in every call."""
+    return TeamEnv(name)

@@ -4,7 +4,7 @@ import jax
 from jax.typing import ArrayLike
 
 from jaxsense.core.types import Key
-from jaxsense.interfaces.extras import extra
+from jaxsense.interfaces.common import extra
 
 with extra("rejax"):
     from jaxsense.interfaces import gymnax
@@ -23,17 +23,6 @@ class MapEnv(gymnax.MapEnv):
         action: ArrayLike,
         params: gymnax.MapEnvParams | None = None,
     ) -> tuple[jax.Array, gymnax.MapEnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """Takes one action, and restarts an episode that has ended.
-
-        Args:
-          key: random key.
-          state: the current state.
-          action: `[]` integer, a PoI or N for NOP.
-          params: of the environment; the default ones by default.
-
-        Returns:
-          Observation, state, reward, whether the episode has ended, and info.
-        """
-        result = super().step(key, state, action, params)
-        observation, state, reward, terminated, truncated, info = result
-        return observation, state, reward, terminated | truncated, info
+        """Takes one action, and restarts an episode that has ended."""
+        *found, terminated, truncated, info = super().step(key, state, action, params)
+        return *found, terminated | truncated, info

@@ -5,13 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxsense.interfaces.extras import extra
+from jaxsense.interfaces.common import extra
 
 with extra("sb3"):
-    from gymnasium.vector import (  # pyright: ignore[reportMissingImports]
-        AutoresetMode,
-        VectorEnv,
-    )
+    from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 Indices = Iterable[int] | int | None
@@ -27,11 +24,7 @@ class MapVecEnv(VecEnv):
     """
 
     def __init__(self, env: VectorEnv):
-        """Wraps an environment whose episodes restart in the step in which they end.
-
-        Raises:
-          ValueError: if they do not.
-        """
+        """Wraps an environment whose episodes restart in the step in which they end."""
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"autoreset_mode = {mode}: must be AutoresetMode.SAME_STEP")
@@ -67,44 +60,23 @@ class MapVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Returns the shared attribute once for each index.
-
-        Args:
-          attr_name: its name.
-          indices: of environments; all by default.
-        """
+        """The shared attribute, once for each index."""
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
-        """Sets the shared attribute.
-
-        Args:
-          attr_name: its name.
-          value: its value.
-          indices: not used.
-        """
+        """Sets the shared attribute."""
+        del indices
         setattr(self.env, attr_name, value)
 
     def env_method(
         self, method_name: str, *args: object, indices: Indices = None, **more: object
     ) -> list:
-        """Calls the shared method and returns its result, or its row, once for each index.
-
-        Args:
-          method_name: its name.
-          *args: its arguments.
-          indices: of environments; all by default.
-          **more: its arguments by name.
-        """
+        """Result of the shared method, or its row, once for each index."""
         result = getattr(self.env, method_name)(*args, **more)
         has_rows = method_name == "action_masks"
         return [result[i] if has_rows else result for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """Returns False for each index: no environment has its own wrapper.
-
-        Args:
-          wrapper_class: not used.
-          indices: of environments; all by default.
-        """
+        """False for each index: no environment has its own wrapper."""
+        del wrapper_class
         return [False for _ in self._get_indices(indices)]

@@ -1,306 +1,508 @@
-"""Translates what JAX has traced into graphs of ONNX operators, primitive by primitive.
+"""Translates what JAX has traced into ONNX graphs, primitive by primitive.
 
 The graph of a function follows from the function itself, so that a new fusion, sensor or policy
-needs no line here, unless it uses a primitive that has no translation yet.
+needs no line here, unless it uses a primitive that `_OPERATORS` lacks.
 """
 
-import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+import ast
+import functools
+import hashlib
+import itertools
+from collections import ChainMap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
-from jax.core import Atom, ShapedArray
+import onnx
 from jax.extend import core
-from jax.lax import GatherScatterMode
-from jax.typing import ArrayLike
+from jax.lax import GatherScatterMode, RoundingMethod
 from jaxtyping import PyTree
+from onnx import checker, helper, numpy_helper
 
-from jaxsense.interfaces.graph import Array, Builder, Constants, Graph
-from jaxsense.interfaces.operators import SAME, Operators, Size, aval, described
+OPSET, IR_VERSION = 18, 9
+"""The version of the operators, and of the file: of December 2022, so that old runtimes read it."""
 
-_INLINED = ("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call")
-
-
-class Translator(Operators):
-    """Translates the equations of a function, also those that take indices, and loops."""
-
-    def run(
-        self, jaxpr: core.Jaxpr, consts: Sequence[ArrayLike | str], inputs: Sequence[str]
-    ) -> list[str]:
-        """Translates all equations, and returns the names of the outputs.
-
-        Args:
-          jaxpr: what was traced.
-          consts: its constants, arrays or names.
-          inputs: names of its inputs.
-
-        Raises:
-          NotImplementedError: if a primitive has no translation.
-        """
-        names: dict[core.Var, ArrayLike | str] = dict(zip(jaxpr.constvars, consts, strict=True))
-        names |= dict(zip(jaxpr.invars, inputs, strict=True))
-
-        def read(variable: Atom) -> str:
-            value = variable.val if isinstance(variable, core.Literal) else names[variable]
-            if isinstance(value, str):
-                return value
-            return self.build.constant(np.asarray(value, described(aval(variable))[0]))
-
-        for equation in jaxpr.eqns:
-            # An input that nobody reads, such as a random key, may have no name.
-            given = [read(v) if _is_array(v) else "" for v in equation.invars]
-            outputs = self._equation(equation, given)
-            names |= dict(zip(equation.outvars, outputs, strict=True))
-        return [read(v) for v in jaxpr.outvars]
-
-    def _equation(self, equation: core.JaxprEqn, given: list[str]) -> Sequence[str]:
-        kind, params = equation.primitive.name, equation.params
-        if kind in _INLINED:
-            closed = params.get("jaxpr") or params["call_jaxpr"]
-            return self._closed(closed, given)
-        if kind in SAME:
-            return [self.build.op(SAME[kind], *given)]
-        translate = getattr(self, f"_{kind.replace('-', '_')}", None)
-        if translate is None:
-            raise NotImplementedError(f"the primitive {kind} has no ONNX translation")
-        found = translate(equation, *given)
-        return [found] if isinstance(found, str) else found
-
-    def _closed(self, closed: core.ClosedJaxpr, given: Sequence[str]) -> list[str]:
-        return self.run(closed.jaxpr, closed.consts, given)
-
-    # Indices.
-
-    def _gather(self, equation: core.JaxprEqn, x: str, indices: str) -> str:
-        numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-        shape, rank = aval(equation.invars[0]).shape, len(aval(equation.invars[1]).shape)
-        mapped = [int(axis) for axis in numbers.start_index_map]
-        dropped = [int(axis) for axis in numbers.collapsed_slice_dims]
-        if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
-            raise NotImplementedError("gather that fills has no ONNX translation")
-        if rank == 1:
-            starts = {axis: self.component(indices, 0, i) for i, axis in enumerate(mapped)}
-            return self.without(self.window(x, shape, starts, sizes), dropped)
-        batched = [int(axis) for axis in numbers.operand_batching_dims]
-        together = [int(axis) for axis in numbers.start_indices_batching_dims]
-        # A whole axis starts at 0 wherever it is told to.
-        moved = [axis for axis in mapped if sizes[axis] != shape[axis] or axis in dropped]
-        moved = moved or mapped[:1]
-        wide = [axis for axis in moved if sizes[axis] != 1]
-        rest = [axis for axis in range(len(shape)) if axis not in moved + batched]
-        leading = [*together, *(axis for axis in range(rank - 1) if axis not in together)]
-        indices = self.permuted(indices, [*leading, rank - 1])
-        of_batch = [aval(equation.invars[1]).shape[axis] for axis in leading]
-        grid = self.shape([*of_batch, *(sizes[axis] for axis in wide)])
-        parts = []
-        for axis in moved:
-            start = self.component(indices, rank - 1, mapped.index(axis))
-            part = self.inside(start, shape[axis], sizes[axis])
-            if wide:
-                part = self.build.op("Unsqueeze", part, self.build.integers(*range(-len(wide), 0)))
-            if axis in wide:
-                after = range(1, len(wide) - wide.index(axis))
-                steps = self.range(sizes[axis])
-                steps = self.build.op("Unsqueeze", steps, self.build.integers(*after))
-                part = self.build.op("Add", part, steps)
-            part = self.build.op("Expand", part, grid)
-            parts.append(self.build.op("Unsqueeze", part, self.build.integers(-1)))
-        x = self.permuted(x, batched + moved + rest)
-        index = self.build.op("Concat", *parts, axis=-1)
-        found = self.build.op("GatherND", x, index, batch_dims=len(batched))
-        # Axes of size 1 that were taken, and are not dropped, come back at the end.
-        kept = [axis for axis in range(len(shape)) if axis not in dropped + batched]
-        single = [axis for axis in kept if axis in moved and axis not in wide]
-        of_window = [*wide, *rest, *single]
-        if single:
-            ends = range(rank - 1 + len(wide + rest), rank - 1 + len(of_window))
-            found = self.build.op("Unsqueeze", found, self.build.integers(*ends))
-        batch = iter([leading.index(axis) for axis in range(rank - 1)])
-        window = iter([rank - 1 + of_window.index(axis) for axis in kept])
-        offset = [int(axis) for axis in numbers.offset_dims]
-        order = [next(window if n in offset else batch) for n in range(rank - 1 + len(kept))]
-        return self.permuted(found, order)
-
-    def component(self, indices: str, axis: int, i: int) -> str:
-        """One number of each index."""
-        return self.build.op("Gather", indices, self.build.constant(np.int64(i)), axis=axis)
-
-    def _scatter(self, equation: core.JaxprEqn, x: str, indices: str, updates: str) -> str:
-        return self._scattered(equation, x, indices, lambda old: updates)
-
-    def _scatter_add(self, equation: core.JaxprEqn, x: str, indices: str, updates: str) -> str:
-        return self._scattered(equation, x, indices, lambda old: self.build.op("Add", old, updates))
-
-    def _scattered(
-        self, equation: core.JaxprEqn, x: str, indices: str, new: Callable[[str], str]
-    ) -> str:
-        """Changes one row, along one axis, unless the row does not exist."""
-        numbers, shape = equation.params["dimension_numbers"], aval(equation.invars[0]).shape
-        mapped = [int(axis) for axis in numbers.scatter_dims_to_operand_dims]
-        is_one = len(mapped) == 1 and [*map(int, numbers.inserted_window_dims)] == mapped
-        if not is_one or len(aval(equation.invars[1]).shape) != 1 or numbers.operand_batching_dims:
-            raise NotImplementedError("scatter of several rows has no ONNX translation")
-        op, (axis,) = self.build.op, mapped
-        row = self.cast(self.component(indices, 0, 0), np.int64)
-        old = op("Gather", x, self.inside(row, shape[axis]), axis=axis)
-        is_row = op("Equal", self.range(shape[axis]), row)
-        after = [n for n in range(len(shape)) if n != axis]
-        if after:
-            is_row = op("Unsqueeze", is_row, self.build.integers(*after))
-        value = op("Unsqueeze", new(old), self.build.integers(axis))
-        if aval(equation.invars[0]).dtype == bool:
-            return op("Or", op("And", is_row, value), op("And", op("Not", is_row), x))
-        return op("Where", is_row, value, x)
-
-    # Loops and branches.
-
-    def _platform_index(self, equation: core.JaxprEqn) -> str:
-        platforms = equation.params["platforms"]
-        return self.build.constant(np.int32(platforms.index(None)))
-
-    def _cond(self, equation: core.JaxprEqn, index: str, *given: str) -> Sequence[str]:
-        branches, arrays = equation.params["branches"], self.build.constants.arrays
-        if index in arrays:
-            return self._closed(branches[int(arrays[index])], given)
-        if len(branches) != 2:
-            raise NotImplementedError("a choice among more than two has no ONNX translation")
-        no, yes = (
-            self._within({}, lambda inner, branch=branch: inner._closed(branch, given))
-            for branch in branches
-        )
-        is_second = self.cast(index, bool)
-        number = len(equation.outvars)
-        return self.build.control("If", number, is_second, then_branch=yes, else_branch=no)
-
-    def _within(
-        self, inputs: dict[str, Array], body: Callable[["Translator"], Sequence[str]]
-    ) -> Graph:
-        """A graph within this one, of which each output has a name of its own."""
-        build = Builder(self.build.constants, self.build)
-        build.graph.inputs = inputs
-        outputs = body(Translator(build, self.sizes))
-        build.graph.outputs = [build.ops("Identity", 1, name)[0] for name in outputs]
-        return build.graph
-
-    def _loop(
-        self,
-        equation: core.JaxprEqn,
-        most: str,
-        goes_on: str,
-        carry: Sequence[str],
-        avals: Sequence[ShapedArray],
-        body: Callable[["Translator", str, list[str]], Sequence[str]],
-    ) -> Sequence[str]:
-        """ONNX's loop; `body(inner, step, carry)` gives whether it continues, carry and rows."""
-        kinds: list[Array] = [("int64", ()), ("bool", ()), *map(described, avals)]
-        inputs = {self.build.constants.name(): kind for kind in kinds}
-        step, _, *within = inputs
-        graph = self._within(inputs, lambda inner: body(inner, step, within))
-        return self.build.control("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
-
-    def _scan(self, equation: core.JaxprEqn, *given: str) -> Sequence[str]:
-        params = equation.params
-        if params["reverse"]:
-            raise NotImplementedError("a scan from the end has no ONNX translation")
-        inner, before, after = params["jaxpr"], equation.invars, equation.outvars
-        # What moves along has one axis more outside; versions of JAX name the numbers otherwise.
-        rows = sum(aval(v).ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
-        number = sum(aval(v).ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
-        last = len(before) - rows
-        first = last - number
-        consts, carry, moving = given[:first], given[first:last], given[last:]
-        true = self.build.constant(np.bool_(True))
-
-        def body(inner: "Translator", step: str, carry: list[str]) -> Sequence[str]:
-            of_step = [inner.build.op("Gather", row, step, axis=0) for row in moving]
-            return [true, *inner._closed(params["jaxpr"], [*consts, *carry, *of_step])]
-
-        avals = [aval(v) for v in before[first:last]]
-        return self._loop(equation, self.size(params["length"]), true, carry, avals, body)
-
-    def _while(self, equation: core.JaxprEqn, *given: str) -> Sequence[str]:
-        params = equation.params
-        first, last = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-        of_cond, of_body, carry = given[:first], given[first:last], given[last:]
-        goes_on = self._closed(params["cond_jaxpr"], [*of_cond, *carry])[0]
-
-        def body(inner: "Translator", step: str, carry: list[str]) -> Sequence[str]:
-            after = inner._closed(params["body_jaxpr"], [*of_body, *carry])
-            return [*inner._closed(params["cond_jaxpr"], [*of_cond, *after]), *after]
-
-        avals = [aval(v) for v in equation.invars[last:]]
-        return self._loop(equation, "", goes_on, carry, avals, body)
+Struct = jax.ShapeDtypeStruct
+Equation = Any
+"""Of a function that JAX has traced."""
+Size = Any
+"""The size of an axis: a number, or an expression of JAX such as `pois + 1`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """A translated function.
+class Graph:
+    """A graph of operators so far; arrays are known by their names.
 
     Attributes:
-      graph: its operators; outputs in the order of `outputs`.
-      outputs: dtype and shape of each output, by name; an axis with a name has any size.
+      constants: arrays by name, of all graphs.
+      sizes: names of the numbers that hold the sizes of named axes.
+      names: new ones.
+      known: outputs of operators here and in the graphs around.
+      nodes: operators, in their order.
     """
 
-    graph: Graph
-    outputs: dict[str, Array]
+    def __init__(
+        self,
+        constants: dict[str, np.ndarray],
+        sizes: dict[str, str],
+        names: Iterator[str],
+        known: ChainMap[Any, str],
+    ):
+        self.constants, self.sizes, self.names, self.known = constants, sizes, names, known
+        self.nodes: list[onnx.NodeProto] = []
+
+    def constant(self, value: Any) -> str:
+        """The name of an array, which says what it holds."""
+        value = np.asarray(value, np.int64 if isinstance(value, list) else None)
+        content = hashlib.sha256(value.tobytes()).hexdigest()[:16]
+        name = f"{value.dtype}{list(value.shape)}{content}"
+        self.constants[name] = value
+        return name
+
+    def ops(self, operator: str, number: int, *inputs: Any, **attributes: Any) -> list[str]:
+        """Applies an operator to names and numbers; returns the names of its outputs."""
+        given = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        outputs = [next(self.names) for _ in range(number)]
+        self.nodes.append(helper.make_node(operator, given, outputs, **attributes))
+        return outputs
+
+    def op(self, operator: str, *inputs: Any, **attributes: Any) -> str:
+        """Applies an operator with one output, on the same inputs once."""
+        given = [x if isinstance(x, str) else self.constant(x) for x in inputs]
+        key = operator, *given, repr(attributes)
+        if key not in self.known:
+            (self.known[key],) = self.ops(operator, 1, *given, **attributes)
+        return self.known[key]
+
+    def cast(self, x: str, dtype: Any) -> str:
+        """An array with another dtype."""
+        return self.op("Cast", x, to=_kind(dtype))
+
+    def where(self, which: str, yes: str, no: str, dtype: Any) -> str:
+        """Elements of one of two arrays; runtimes choose no bool."""
+        if np.dtype(dtype).kind != "b":
+            return self.op("Where", which, yes, no)
+        chosen = self.op("And", which, yes), self.op("And", self.op("Not", which), no)
+        return self.op("Or", *chosen)
+
+    def size(self, size: Size) -> str | int:
+        """The size of an axis: a number, or the name of one; a polynomial such as `2*pois + 1`."""
+
+        def read(tree: ast.expr) -> Any:
+            operators: dict[type, str] = {
+                ast.Add: "Add", ast.Sub: "Sub", ast.Mult: "Mul", ast.Pow: "Pow", ast.USub: "Neg"
+            }  # fmt: skip
+            match tree:
+                case ast.Constant(value=value):
+                    return value
+                case ast.Name(id=name):
+                    return self.sizes[name]
+                case ast.UnaryOp(op=op, operand=operand) if type(op) in operators:
+                    return self.op(operators[type(op)], read(operand))
+                case ast.BinOp(left=left, op=op, right=right) if type(op) in operators:
+                    return self.op(operators[type(op)], read(left), read(right))
+            raise NotImplementedError(f"the size {size} has no ONNX translation")
+
+        return read(ast.parse(str(size).replace("^", "**"), mode="eval").body)
+
+    def shape(self, sizes: Sequence[Size]) -> str:
+        """A list of sizes, int64."""
+        if all(isinstance(size, int | np.integer) for size in sizes):
+            return self.constant(list(sizes))
+        return self.op("Concat", *(self.op("Reshape", self.size(n), [1]) for n in sizes), axis=0)
+
+    def range(self, size: Size) -> str:
+        """The numbers from 0 below a size, int64."""
+        return self.op("Range", 0, self.size(size), 1)
+
+    def broadcast(self, x: str, shape: Sequence[Size], axes: Sequence[int]) -> str:
+        """An array repeated to a shape, where its axes are `axes`."""
+        new = [axis for axis in range(len(shape)) if axis not in axes]
+        return self.op("Expand", self.op("Unsqueeze", x, new), self.shape(shape))
+
+    def start(self, index: str, size: Size, window: Size = 1) -> str:
+        """The index where a window starts, moved into its axis as XLA does."""
+        last = self.op("Min", self.cast(index, np.int64), self.size(size - window))
+        return self.op("Max", last, 0)
+
+    def taken(
+        self, x: str, shape: Sequence[Size], terms: Sequence[Sequence[tuple[str, Sequence[int]]]]
+    ) -> str:
+        """An array of a shape of elements of another.
+
+        On each axis of the other, their index is a sum of terms, each along some axes of the shape.
+        """
+        indices = []
+        for of_axis in terms:
+            index = self.op("Expand", 0, self.shape(shape))
+            for term, axes in of_axis:
+                index = self.op("Add", index, self.broadcast(term, shape, axes))
+            indices.append(self.op("Unsqueeze", index, [-1]))
+        return self.op("GatherND", x, self.op("Concat", *indices, axis=-1))
+
+    def run(self, closed: core.ClosedJaxpr, inputs: Sequence[str]) -> list[str]:
+        """Translates all equations of a function, and returns the names of its outputs."""
+        jaxpr = closed.jaxpr
+        names = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
+
+        def read(variable: Any) -> str:
+            dtype = variable.aval.dtype
+            value = variable.val if hasattr(variable, "val") else names[variable]
+            if jnp.issubdtype(dtype, jax.dtypes.extended):
+                return ""  # a random key, which nobody reads
+            return value if isinstance(value, str) else self.constant(np.asarray(value, dtype))
+
+        for equation in jaxpr.eqns:
+            kind, given = equation.primitive.name, map(read, equation.invars)
+            operator = _OPERATORS.get(kind)
+            if operator is None:
+                raise NotImplementedError(f"the primitive {kind} has no ONNX translation")
+            is_one = isinstance(operator, str)
+            found = self.op(operator, *given) if is_one else operator(self, equation, *given)
+            outputs = [found] if isinstance(found, str) else found
+            names |= dict(zip(equation.outvars, outputs, strict=True))
+        return [read(variable) for variable in jaxpr.outvars]
+
+    def within(
+        self, inputs: Mapping[str, Any], body: Callable[["Graph"], Sequence[str]]
+    ) -> onnx.GraphProto:
+        """A graph within this one, of which each output has a name of its own."""
+        inner = Graph(self.constants, self.sizes, self.names, self.known.new_child())
+        outputs = [inner.ops("Identity", 1, x)[0] for x in body(inner)]
+        untyped = [helper.make_empty_tensor_value_info(x) for x in outputs]
+        given = [_info(*each) for each in inputs.items()]
+        return helper.make_graph(inner.nodes, "body", given, untyped)
+
+    def loop(
+        self,
+        most: Any,
+        goes_on: Any,
+        carry: Sequence[str],
+        equation: Equation,
+        body: Callable[["Graph", str, list[str]], Sequence[str]],
+    ) -> list[str]:
+        """ONNX's loop: `body(inner, step, carry)` gives whether it continues, carry and rows."""
+        of_carry = [v.aval for v in equation.outvars[: len(carry)]]
+        kinds = [Struct((), np.int64), Struct((), bool), *of_carry]
+        inputs = {next(self.names): kind for kind in kinds}
+        step, _, *within = inputs
+        graph = self.within(inputs, lambda inner: body(inner, step, within))
+        return self.ops("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
+
+
+def _info(name: str, array: Any) -> onnx.ValueInfoProto:
+    shape = [n if isinstance(n, int) else str(n) for n in array.shape]
+    return helper.make_tensor_value_info(name, _kind(array.dtype), shape)
+
+
+def _kind(dtype: Any) -> int:
+    return helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+
+
+# Each of these builds the operators of an equation of JAX, from the names of its inputs.
+
+
+def _inlined(graph: Graph, e: Equation, *given: str) -> list[str]:
+    return graph.run(e.params.get("jaxpr") or e.params["call_jaxpr"], given)
+
+
+def _round(graph: Graph, e: Equation, x: str) -> str:
+    if e.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
+        raise NotImplementedError("rounding away from zero has no ONNX translation")
+    return graph.op("Round", x)
+
+
+def _is_finite(graph: Graph, e: Equation, x: str) -> str:
+    return graph.op("Not", graph.op("Or", graph.op("IsNaN", x), graph.op("IsInf", x)))
+
+
+def _atan2(graph: Graph, e: Equation, y: str, x: str) -> str:
+    op = graph.op
+    steep = op("Atan", op("Div", op("Abs", y), op("Abs", x)))
+    ahead = op("Where", op("Equal", y, np.float32(0)), np.float32(0), steep)
+    above = op("Where", op("Less", x, np.float32(0)), op("Sub", np.float32(np.pi), ahead), ahead)
+    return op("Where", op("Less", y, np.float32(0)), op("Neg", above), above)
+
+
+def _select(graph: Graph, e: Equation, which: str, *cases: str) -> str:
+    if len(cases) != 2 or e.invars[0].aval.dtype.kind != "b":
+        raise NotImplementedError("a choice among more than two has no ONNX translation")
+    return graph.where(which, cases[1], cases[0], e.invars[1].aval.dtype)
+
+
+def _iota(graph: Graph, e: Equation) -> str:
+    shape, axis = e.params["shape"], e.params["dimension"]
+    return graph.broadcast(graph.cast(graph.range(shape[axis]), e.params["dtype"]), shape, [axis])
+
+
+def _broadcast(graph: Graph, e: Equation, x: str, *_: str) -> str:
+    return graph.broadcast(x, e.params["shape"], e.params["broadcast_dimensions"])
+
+
+def _stack(graph: Graph, e: Equation, *parts: str) -> str:
+    axis = int(e.params["axis"])
+    return graph.op("Concat", *(graph.op("Unsqueeze", x, [axis]) for x in parts), axis=axis)
+
+
+def _split(graph: Graph, e: Equation, x: str) -> list[str]:
+    sizes = list(e.params["sizes"])
+    return graph.ops("Split", len(sizes), x, sizes, axis=int(e.params["axis"]))
+
+
+def _slice(graph: Graph, e: Equation, x: str) -> str:
+    starts, ends = (graph.shape(e.params[f"{end}_indices"]) for end in ("start", "limit"))
+    axes = list(range(len(e.params["start_indices"])))
+    return graph.op("Slice", x, starts, ends, axes, list(e.params["strides"] or [1] * len(axes)))
+
+
+def _dynamic_slice(graph: Graph, e: Equation, x: str, *starts: str) -> str:
+    sizes, shape = e.params["slice_sizes"], e.invars[0].aval.shape
+    terms = [
+        [(graph.start(start, shape[axis], sizes[axis]), []), (graph.range(sizes[axis]), [axis])]
+        for axis, start in enumerate(starts)
+    ]
+    return graph.taken(x, sizes, terms)
+
+
+def _reduced(operator: str, dtype: Any = None) -> Callable[..., str]:
+    def reduced(graph: Graph, e: Equation, x: str) -> str:
+        x = x if dtype is None else graph.cast(x, dtype)
+        axes = list(e.params["axes"])
+        found = graph.op(operator, x, axes, keepdims=0, noop_with_empty_axes=1)
+        return found if dtype is None else graph.cast(found, e.outvars[0].aval.dtype)
+
+    return reduced
+
+
+def _best(operator: str) -> Callable[..., str]:
+    def best(graph: Graph, e: Equation, x: str) -> str:
+        (axis,) = e.params["axes"]
+        return graph.cast(
+            graph.op(operator, x, axis=int(axis), keepdims=0), e.params["index_dtype"]
+        )
+
+    return best
+
+
+def _product(graph: Graph, e: Equation, x: str, y: str) -> str:
+    (of_x, of_y), (batch_x, batch_y) = e.params["dimension_numbers"]
+    letters = iter("abcdefghijklmnopqrstuvwxyz")
+    left, right = ([next(letters) for _ in v.aval.shape] for v in e.invars)
+    for i, j in zip([*of_x, *batch_x], [*of_y, *batch_y], strict=True):
+        right[j] = left[i]
+    both, summed = [left[i] for i in batch_x], [left[i] for i in of_x]
+    free = [n for n in left + right if n not in both + summed]
+    sides = f"{''.join(left)},{''.join(right)}->{''.join(both + free)}"
+    return graph.op("Einsum", x, y, equation=sides)
+
+
+def _gather(graph: Graph, e: Equation, x: str, indices: str) -> str:
+    if e.params["mode"] == GatherScatterMode.FILL_OR_DROP:
+        raise NotImplementedError("gather that fills has no ONNX translation")
+    numbers, sizes = e.params["dimension_numbers"], e.params["slice_sizes"]
+    shape, found = e.invars[0].aval.shape, e.outvars[0].aval.shape
+    mapped, batched = [*numbers.start_index_map], [*numbers.operand_batching_dims]
+    batch = [axis for axis in range(len(found)) if axis not in numbers.offset_dims]
+    dropped = {*numbers.collapsed_slice_dims, *batched}
+    kept = [axis for axis in range(len(shape)) if axis not in dropped]
+    terms: list[list[tuple[str, Sequence[int]]]] = [[] for _ in shape]
+    for i, axis in enumerate(mapped):
+        start = graph.op("Gather", indices, i, axis=e.invars[1].aval.ndim - 1)
+        terms[axis].append((graph.start(start, shape[axis], sizes[axis]), batch))
+    for axis, at in zip(batched, numbers.start_indices_batching_dims, strict=True):
+        terms[axis].append((graph.range(shape[axis]), [batch[at]]))
+    for axis, at in zip(kept, numbers.offset_dims, strict=True):
+        terms[axis].append((graph.range(sizes[axis]), [at]))
+    return graph.taken(x, found, terms)
+
+
+def _scatter(adds: bool) -> Callable[..., str]:
+    """Changes one row, along one axis, unless the row does not exist."""
+
+    def scatter(graph: Graph, e: Equation, x: str, indices: str, updates: str) -> str:
+        numbers, shape = e.params["dimension_numbers"], e.invars[0].aval.shape
+        mapped = [*numbers.scatter_dims_to_operand_dims]
+        is_one = len(mapped) == 1 and [*numbers.inserted_window_dims] == mapped
+        if not is_one or e.invars[1].aval.ndim != 1 or numbers.operand_batching_dims:
+            raise NotImplementedError("scatter of several rows has no ONNX translation")
+        (axis,) = mapped
+        row = graph.cast(indices, np.int64)
+        is_row = graph.op("Equal", graph.range(shape[axis]), row)
+        is_row = graph.op("Unsqueeze", is_row, [n for n in range(1, len(shape) - axis)])
+        new = graph.op("Unsqueeze", updates, [axis])
+        new = graph.op("Add", x, new) if adds else new
+        return graph.where(is_row, new, x, e.invars[0].aval.dtype)
+
+    return scatter
+
+
+def _platform_index(graph: Graph, e: Equation) -> str:
+    return graph.constant(np.int32(e.params["platforms"].index(None)))
+
+
+def _cond(graph: Graph, e: Equation, index: str, *given: str) -> list[str]:
+    branches = e.params["branches"]
+    if index in graph.constants:
+        return graph.run(branches[int(graph.constants[index])], given)
+    if len(branches) != 2:
+        raise NotImplementedError("a choice among more than two has no ONNX translation")
+    no, yes = (graph.within({}, lambda inner, b=b: inner.run(b, given)) for b in branches)
+    is_second = graph.cast(index, bool)
+    return graph.ops("If", len(e.outvars), is_second, then_branch=yes, else_branch=no)
+
+
+def _scan(graph: Graph, e: Equation, *given: str) -> list[str]:
+    if e.params["reverse"]:
+        raise NotImplementedError("a scan from the end has no ONNX translation")
+    inner, before, after = e.params["jaxpr"], e.invars, e.outvars
+    # What moves along has one axis more outside; versions of JAX name the numbers otherwise.
+    rows = sum(v.aval.ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
+    number = sum(v.aval.ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
+    last = len(before) - rows
+    consts, carry, moving = given[: last - number], given[last - number : last], given[last:]
+
+    def body(within: Graph, step: str, carry: list[str]) -> list[Any]:
+        of_step = [within.op("Gather", row, step, axis=0) for row in moving]
+        return [within.constant(np.bool_(True)), *within.run(inner, [*consts, *carry, *of_step])]
+
+    return graph.loop(graph.size(e.params["length"]), np.bool_(True), carry, e, body)
+
+
+def _while(graph: Graph, e: Equation, *given: str) -> list[str]:
+    condition, change = e.params["cond_jaxpr"], e.params["body_jaxpr"]
+    first = e.params["cond_nconsts"]
+    last = first + e.params["body_nconsts"]
+
+    def body(within: Graph, step: str, carry: list[str]) -> list[str]:
+        after = within.run(change, [*given[first:last], *carry])
+        return [*within.run(condition, [*given[:first], *after]), *after]
+
+    (goes_on,) = graph.run(condition, [*given[:first], *given[last:]])
+    return graph.loop("", goes_on, given[last:], e, body)
+
+
+_CALLS = "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"
+# Runtimes take `and`, `or` and `not` of bools alone.
+_SAME = (
+    "add", "sub", "mul", "div", "max", "min", "pow", "exp", "log", "tanh", "tan", "sqrt", "abs",
+    "neg", "sign", "floor", "ceil", "and", "or", "not",
+)  # fmt: skip
+_OPERATORS: dict[str, str | Callable[..., str | list[str]]] = {
+    **dict.fromkeys(_CALLS, _inlined),
+    **{name: name.capitalize() for name in _SAME},
+    "logistic": "Sigmoid",
+    "lt": "Less",
+    "le": "LessOrEqual",
+    "gt": "Greater",
+    "ge": "GreaterOrEqual",
+    "eq": "Equal",
+    "copy": "Identity",
+    "stop_gradient": "Identity",
+    "ne": lambda graph, e, x, y: graph.op("Not", graph.op("Equal", x, y)),
+    "rem": lambda graph, e, x, y: graph.op("Mod", x, y, fmod=1),
+    "clamp": lambda graph, e, low, x, high: graph.op("Min", graph.op("Max", x, low), high),
+    "square": lambda graph, e, x: graph.op("Mul", x, x),
+    "rsqrt": lambda graph, e, x: graph.op("Reciprocal", graph.op("Sqrt", x)),
+    "integer_pow": lambda graph, e, x: graph.op("Pow", x, np.int32(e.params["y"])),
+    "convert_element_type": lambda graph, e, x: graph.cast(x, e.params["new_dtype"]),
+    "round": _round,
+    "is_finite": _is_finite,
+    "atan2": _atan2,
+    "select_n": _select,
+    "iota": _iota,
+    "dim_as_value": lambda graph, e: graph.cast(
+        graph.op("Identity", graph.size(e.params["dim"])), e.outvars[0].aval.dtype
+    ),
+    "broadcast_in_dim": _broadcast,
+    "reshape": lambda graph, e, x, *_: graph.op("Reshape", x, graph.shape(e.params["new_sizes"])),
+    "squeeze": lambda graph, e, x: graph.op("Squeeze", x, list(e.params["dimensions"])),
+    "transpose": lambda graph, e, x: graph.op(
+        "Transpose", x, perm=[*map(int, e.params["permutation"])]
+    ),
+    "concatenate": lambda graph, e, *x: graph.op("Concat", *x, axis=int(e.params["dimension"])),
+    "stack": _stack,
+    "split": _split,
+    "slice": _slice,
+    "dynamic_slice": _dynamic_slice,
+    "reduce_sum": _reduced("ReduceSum"),
+    "reduce_max": _reduced("ReduceMax"),
+    "reduce_min": _reduced("ReduceMin"),
+    "reduce_and": _reduced("ReduceMin", np.int32),
+    "reduce_or": _reduced("ReduceMax", np.int32),
+    "argmax": _best("ArgMax"),
+    "argmin": _best("ArgMin"),
+    "dot_general": _product,
+    "gather": _gather,
+    "scatter": _scatter(adds=False),
+    "scatter-add": _scatter(adds=True),
+    "platform_index": _platform_index,
+    "cond": _cond,
+    "scan": _scan,
+    "while": _while,
+}
+"""Primitives of JAX: the operator that each is, or what builds its operators."""
 
 
 def program(
+    name: str,
     apply: Callable[..., dict[str, jax.Array]],
     models: PyTree,
-    inputs: Mapping[str, Array],
-    constants: Constants,
-) -> Program:
-    """Translates a function.
+    inputs: Mapping[str, Struct],
+) -> tuple[bytes, dict[str, Struct]]:
+    """A function as an ONNX file, whose weights are named by their place in the models.
 
     Args:
-      apply: `(models, *inputs) -> {name: output}`.
+      name: of the graph.
+      apply: `(models, *inputs) -> {name: output}`; its docstring says what it does.
       models: a pytree.
-      inputs: dtype and shape of each input, by name; an axis with a name has any size, at least 1.
-      constants: those of `arrays_of(models)`, which get more.
+      inputs: by name; an axis of any size is a dimension of `jax.export.symbolic_shape`.
+
+    Returns:
+      The file, and the outputs by name.
 
     Raises:
       NotImplementedError: if a primitive of the function has no translation.
     """
-    named = sorted({n for _, shape in inputs.values() for n in shape if isinstance(n, str)})
-    axes = export.symbolic_shape(", ".join(named), constraints=[f"{n} >= 1" for n in named])
-    of_name: dict[int | str, Size] = dict(zip(named, axes, strict=True))
-    given = [
-        jax.ShapeDtypeStruct(tuple(of_name.get(n, n) for n in shape), dtype)
-        for dtype, shape in inputs.values()
-    ]
-    models = jax.tree.map(_array, models)
-    closed, found = jax.make_jaxpr(apply, return_shape=True)(models, *given)
-    build = Builder(constants)
-    build.graph.inputs = dict(inputs)
-    sizes = {}
-    for name, (_, shape) in inputs.items():
-        for axis, size in enumerate(shape):
-            if isinstance(size, str) and size not in sizes:
-                whole, which = build.op("Shape", name), build.constant(np.int64(axis))
-                sizes[size] = build.op("Gather", whole, which, axis=0)
-    names = [*arrays_of(models), *inputs]
-    build.graph.outputs = Translator(build, sizes).run(closed.jaxpr, closed.consts, names)
-    outputs = {name: described(x) for name, x in sorted(found.items())}
-    return Program(build.graph.pruned(), outputs)
+    # Parameters that a user has made with NumPy may have 64 bits.
+    models = jax.tree.map(lambda x: np.asarray(jnp.asarray(x)), models)
+    leaves = jax.tree_util.tree_leaves_with_path(models)
+    weights = {jax.tree_util.keystr(p, simple=True, separator="/"): x for p, x in leaves}
+    closed, outputs = jax.make_jaxpr(apply, return_shape=True)(models, *inputs.values())
+    graph = Graph(dict(weights), {}, (f"x{n}" for n in itertools.count()), ChainMap())
+    for key, array in inputs.items():
+        for axis, size in enumerate(array.shape):
+            if not isinstance(size, int):
+                graph.sizes[str(size)] = graph.op("Gather", graph.op("Shape", key), axis, axis=0)
+    found = zip(graph.run(closed, [*weights, *inputs]), sorted(outputs), strict=True)
+    nodes = [*graph.nodes, *(helper.make_node("Identity", [x], [y]) for x, y in found)]
+    nodes, read = _read(nodes, {*outputs})
+    whole = helper.make_graph(
+        nodes,
+        name.replace("+", "_"),
+        [_info(*each) for each in inputs.items()],
+        [_info(*each) for each in outputs.items()],
+        [numpy_helper.from_array(x, key) for key, x in graph.constants.items() if key in read],
+        doc_string=apply.__doc__,
+    )
+    opsets = [helper.make_opsetid("", OPSET)]
+    model = helper.make_model(
+        whole, opset_imports=opsets, ir_version=IR_VERSION, producer_name="jaxsense"
+    )
+    checker.check_model(model)
+    return model.SerializeToString(), outputs
 
 
-def arrays_of(models: PyTree) -> dict[str, np.ndarray]:
-    """All arrays of a pytree, by their place in it, for example `"novelty/strength"`.
+def _read(nodes: list[onnx.NodeProto], wanted: set[str]) -> tuple[list[onnx.NodeProto], set[str]]:
+    """The operators that lead to names, and all names that they read."""
 
-    Args:
-      models: the pytree.
-    """
-    leaves = jax.tree_util.tree_leaves_with_path(jax.tree.map(_array, models))
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
+    def names_of(node: onnx.NodeProto) -> set[str]:
+        inner = [x for attribute in node.attribute for x in attribute.g.node]
+        return functools.reduce(set.union, map(names_of, inner), {*node.input})
 
-
-def _array(x: ArrayLike) -> np.ndarray:
-    x = np.asarray(x)
-    return x.astype(np.float32) if x.dtype == np.float64 else x
-
-
-def _is_array(variable: Atom) -> bool:
-    return not jnp.issubdtype(aval(variable).dtype, jax.dtypes.extended)
+    kept = []
+    for node in reversed(nodes):
+        if not wanted.isdisjoint(node.output):
+            kept.append(node)
+            wanted = wanted | names_of(node)
+    return kept[::-1], wanted

@@ -1,16 +1,28 @@
+import dataclasses
+
 import jax
+import jax.numpy as jnp
 import pytest
-from exporting import CONFIG, with_classes
+from exporting import CONFIG
 from smoke import save_models
 
 from jaxsense import export
-from jaxsense.models import init
+from jaxsense.core.types import Belief
+from jaxsense.models import init, make_in_place
 from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.vae.novelty import Novelty
 
 
 @pytest.fixture(scope="session")
 def models():
-    return with_classes(init(jax.random.key(0), CONFIG), CONFIG)
+    """Models, with classes at random places in the latent space."""
+    untrained = init(jax.random.key(0), CONFIG)
+    means = jax.random.normal(jax.random.key(1), untrained.fusion.classes.mean.shape)
+    return dataclasses.replace(
+        untrained,
+        fusion=make_in_place(CONFIG, untrained.jmvae, Belief(means, jnp.ones_like(means))),
+        novelty=Novelty(jnp.array([5.0, 20.0]), jnp.array([0.3, 0.9])),
+    )
 
 
 @pytest.fixture(scope="session")

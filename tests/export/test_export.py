@@ -1,73 +1,75 @@
-"""The command `export`, its file, and the example that plays it without jaxsense and JAX."""
+"""The command `export`, and the example that plays its file without jaxsense and JAX."""
 
-import dataclasses
-import json
 import re
+import shutil
+import subprocess
 import sys
-import zipfile
+from pathlib import Path
 
-import jax
-import onnx
 import pytest
-from exporting import ABSENT, CONFIG, COPIED, run_alone
+from exporting import EXAMPLE
 from smoke import error_line
 
 from jaxsense import export, interfaces
-from jaxsense.models import init
+from jaxsense.interfaces import robot
+from jaxsense.recorded import resampling
+
+COPIED = EXAMPLE, Path(robot.__file__), Path(resampling.__file__)
+"""What a robot needs besides an archive."""
+ALONE = """
+import sys
+
+absent = sys.argv.pop(1).split(",")
+
+class Only:
+    def find_spec(self, name, *_):
+        if name.partition(".")[0] in absent:
+            raise ModuleNotFoundError(f"{name} is not here", name=name)
+
+sys.meta_path.insert(0, Only())
+sys.path.insert(0, sys.argv.pop(1))
+import resampling
+import run_exported
+run_exported.main()
+"""
+ABSENT = "jaxsense,jax,jaxlib,onnx"
 
 
-def test_onnx_files_name_what_they_take_and_give(file):
-    with zipfile.ZipFile(file) as files:
-        contents = json.loads(files.read("contents.json"))
-        for name, about in contents["programs"].items():
-            graph = onnx.load_model_from_string(files.read(f"{name}.onnx")).graph
-            for ends, key in ((graph.input, "inputs"), (graph.output, "outputs")):
-                shapes = {
-                    each.name: [n.dim_param or n.dim_value for n in each.type.tensor_type.shape.dim]
-                    for each in ends
-                }
-                assert shapes == {n: x["shape"] for n, x in about[key].items()}
+def run_alone(folder, *arguments, absent=ABSENT, copied=COPIED):
+    """Runs the example where nothing is there but what a robot needs."""
+    for file in copied:
+        shutil.copy(file, folder)
+    command = [sys.executable, "-I", "-c", ALONE, absent, folder, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("variance", [20.0, 5.0])
-def test_contents_hold_the_belief_before_any_look(variance):
-    config = dataclasses.replace(
-        CONFIG, mdp=dataclasses.replace(CONFIG.mdp, unseen_variance=variance)
-    )
-    contents = export._description(config, init(jax.random.key(0), config))
-    assert contents["unseen"] == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
-
-
-EXAMPLE = "import run_exported\nrun_exported.main()"
-
-
-def test_the_example_plays_a_map_and_refuses_other_files(file, tmp_path):
-    done = run_alone(EXAMPLE, file)
+def test_the_example_plays_a_map_without_jaxsense(file, tmp_path):
+    done = run_alone(tmp_path, file)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert [line for line in lines if line.startswith("PoI 2 is a red cube; the map says: ")]
-    done = run_alone(EXAMPLE, tmp_path / "nothing")
-    assert done.returncode == 1
-    assert done.stderr.endswith("nothing: cannot be read (no such file)\n")
 
 
 @pytest.mark.parametrize(
     ("absent", "copied", "expected"),
     [
-        (f"{ABSENT},onnxruntime", COPIED, "onnxruntime: pip install onnxruntime"),
-        (ABSENT, COPIED[:1], "robot.py: copy it next to this file"),
+        (f"{ABSENT},onnxruntime", COPIED, "needs onnxruntime: pip install onnxruntime"),
+        (ABSENT, (COPIED[0], COPIED[2]), "needs robot.py: copy it next to this file"),
+        (ABSENT, COPIED, "nothing: cannot be read (no such file)"),
     ],
 )
-def test_the_example_names_what_is_missing(file, absent, copied, expected):
-    done = run_alone(EXAMPLE, file, absent=absent, copied=copied)
-    assert (done.returncode, done.stderr) == (1, f"needs {expected}\n")
+def test_the_example_names_what_is_missing(tmp_path, absent, copied, expected):
+    done = run_alone(tmp_path, tmp_path / "nothing", absent=absent, copied=copied)
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"{expected}\n")
 
 
 @pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
 def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys, package):
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, "jaxsense.interfaces.robot", raising=False)
-    monkeypatch.delattr(interfaces, "robot", raising=False)
+    for name in ("robot", "translate"):
+        monkeypatch.delitem(sys.modules, f"jaxsense.interfaces.{name}", raising=False)
+        monkeypatch.delattr(interfaces, name, raising=False)
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
     assert line == f"jaxsense.export: {package} is not installed: pip install 'jaxsense[export]'"
     assert not [*tmp_path.iterdir()]
@@ -82,29 +84,9 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
         "out": ([str(run), "--out", str(existing)], "out = .*already exists; must be a new file"),
         "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
     }[problem]
-    with pytest.raises(SystemExit) as stop:
-        export.main(argv)
-    message = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert message.count("\n") == 1
-    assert message.startswith("jaxsense.export: ")
-    assert re.search(expected, message)
+    assert re.search(expected, error_line(argv, capsys, export))
     assert existing.read_text() == "precious"
     assert list(tmp_path.iterdir()) == [existing]
-
-
-def test_a_file_that_appears_meanwhile_is_not_replaced(run, tmp_path, monkeypatch, capsys):
-    path = tmp_path / "x.zip"
-
-    def meanwhile(*_):
-        path.write_text("of another process", encoding="utf-8")
-        return b"ours"
-
-    monkeypatch.setattr(export, "archive", meanwhile)
-    line = error_line([str(run), "--out", str(path)], capsys, export)
-    assert "x.zip': already exists; must be a new file" in line
-    assert [*tmp_path.iterdir()] == [path]
-    assert path.read_text(encoding="utf-8") == "of another process"
 
 
 def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
@@ -115,16 +97,3 @@ def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         export.main([str(run), "--out", str(tmp_path / "x.zip")])
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_robot_resamples_scans_without_jaxsense():
-    code = """
-import numpy as np
-from resampling import resample
-
-angles, ranges = np.array([-0.1, 0.1]), np.array([1.0, 1.04])
-print(resample(np.array([0.05, 0.15, 1.0]), angles, ranges, measures_distance=True))
-"""
-    found = run_alone(code)
-    # Three quarters of the way between both beams; a quarter of a step beyond the second one.
-    assert (found.stdout, found.returncode) == ("[1.03 1.04  nan]\n", 0), found.stderr

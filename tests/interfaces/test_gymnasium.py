@@ -1,6 +1,9 @@
-"""The vector environment: the MDP's own functions, and Gymnasium's rules of what follows an end."""
+"""Gymnasium's own checks, its rules of what follows an end, pictures, and refusals."""
 
 import dataclasses
+import functools
+import json
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +14,16 @@ import small
 pytest.importorskip("gymnasium", reason="needs the extra jaxsense[gymnasium]")
 
 import gymnasium
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
+import jaxsense
+from jaxsense.config import ConfigError
 from jaxsense.dqn import map_mdp, observation
+from jaxsense.interfaces import common, prepared_starts
 from jaxsense.interfaces import gymnasium as ours
-from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 
 LIDAR, NOP = 1, 3
@@ -27,6 +34,11 @@ def starts():
     return prepared_starts(jax.random.key(0), small.small_mdp(), 16)
 
 
+@pytest.fixture
+def make(starts):
+    return functools.partial(MapVectorEnv, small.small_mdp(), LIDAR, starts=starts)
+
+
 class OneEnv(gymnasium.Env):
     """A single environment, always from the same start; without noise, as `small.noiseless`."""
 
@@ -35,43 +47,18 @@ class OneEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (12,), np.float32)
         self.action_space = gymnasium.spaces.Discrete(4)
 
-    def observation(self):
+    def seen(self):
         return np.asarray(observation(self.state.belief))
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.state = self.start
-        return self.observation(), self.info()
+        return self.seen(), {"action_mask": np.ones(4, np.int8)}
 
     def step(self, action):
         self.state, outcome = self.mdp_step(jax.random.key(0), self.state, jnp.int32(action))
         ends = bool(outcome.terminated), bool(outcome.truncated)
-        return self.observation(), float(outcome.reward), *ends, self.info()
-
-    def info(self):
-        return {"action_mask": np.ones(4, np.int8)}
-
-
-def test_every_step_equals_the_mdps(starts):
-    """The keys are those that the environment splits from its seed."""
-    mdp = small.small_mdp()
-    env = MapVectorEnv(mdp, LIDAR, 4, starts, AutoresetMode.DISABLED)
-    observations, _ = env.reset(seed=3)
-    seed = np.random.Generator(np.random.PCG64(np.random.SeedSequence(3))).integers(2**32)
-    key, start_key = jax.random.split(jax.random.key(int(seed)))
-    rows = [int(jax.random.randint(k, (), 0, 16)) for k in jax.random.split(start_key, 4)]
-    states = jax.tree.map(lambda x: x[np.array(rows)], starts)
-    step = jax.jit(jax.vmap(lambda k, s, a: map_mdp.step(k, mdp, s, a, LIDAR)))
-    for actions in ([0, 1, 2, 0], [1, 1, 0, 2], [2, 0, NOP, NOP]):
-        expected = jax.vmap(observation)(states.belief)
-        np.testing.assert_allclose(observations, expected, rtol=1e-6, atol=1e-6)
-        observations, rewards, terminations, truncations, _ = env.step(np.array(actions))
-        key, step_key = jax.random.split(key)
-        states, outcome = step(jax.random.split(step_key, 4), states, jnp.array(actions))
-        np.testing.assert_allclose(rewards, outcome.reward, rtol=1e-5)
-        np.testing.assert_array_equal(terminations, outcome.terminated)
-        np.testing.assert_array_equal(truncations, outcome.truncated)
-    assert list(terminations) == [False, False, True, True]
+        return self.seen(), float(outcome.reward), *ends, {"action_mask": np.ones(4, np.int8)}
 
 
 def assert_same(ours, theirs):
@@ -80,14 +67,11 @@ def assert_same(ours, theirs):
         assert (mine.shape, mine.dtype) == (reference.shape, reference.dtype)
         np.testing.assert_allclose(mine, reference, atol=1e-5)
     assert ours[4].keys() == theirs[4].keys()
-    for name, value in theirs[4].items():
-        if name == "final_obs":
-            for mine, reference in zip(ours[4][name], value, strict=True):
-                assert (mine is None) == (reference is None)
-                if mine is not None:
-                    np.testing.assert_allclose(mine, reference, atol=1e-5)
-        else:
-            jax.tree.map(np.testing.assert_array_equal, ours[4][name], value)
+    mine, reference = (each[4].pop("final_obs", [None]) for each in (ours, theirs))
+    assert [x is None for x in mine] == [x is None for x in reference]
+    for x, y in zip(mine, reference, strict=True):
+        np.testing.assert_allclose(0 if x is None else x, 0 if y is None else y, atol=1e-5)
+    jax.tree.map(np.testing.assert_array_equal, ours[4], theirs[4])
 
 
 @pytest.mark.slow
@@ -109,90 +93,147 @@ def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
         # The first of them never ends by itself, and so is cut after 20 steps.
         actions = np.array([0, rng.integers(4), rng.integers(4)])
         mine = ours.step(actions)
-        assert_same(mine, theirs.step(actions))
         number_of_ends += mine[2].sum(), mine[3].sum()
+        assert_same(mine, theirs.step(actions))
         if i % 9 == 8:
             ours.reset(options={"reset_mask": np.array([False, True, True])})
             theirs.reset(options={"reset_mask": np.array([False, True, True])})
     assert (number_of_ends > 0).all()
 
 
-def test_without_autoreset_only_the_masked_environments_start_again(starts):
-    env = MapVectorEnv(small.small_mdp(), LIDAR, 3, starts, "Disabled")
+@pytest.mark.parametrize(("mode", "later"), [("NextStep", 1), ("SameStep", 0)])
+def test_an_ended_episode_starts_again(make, mode, later):
+    env = make(num_envs=2, autoreset_mode=mode)
+    first, _ = env.reset(seed=1)
+    seen, _, ended, _, infos = env.step(np.array([NOP, 0]))
+    assert ended.tolist() == [True, False]
+    # NOP shows the same map, which the last observation is before a new start.
+    last = seen[0] if later else infos["final_obs"][0]
+    np.testing.assert_array_equal(last, first[0])
+    if later:
+        seen, rewards, ended, *_ = env.step(np.array([0, 0]))
+        assert rewards[0] == 0
+        assert not ended.any()
+    assert (seen[0] != first[0]).any()
+
+
+@pytest.mark.parametrize("kind", [list, np.array])
+def test_without_autoreset_only_the_masked_environments_start_again(make, kind):
+    env = make(num_envs=3, autoreset_mode="Disabled")
     env.reset(seed=0)
-    observations, _, terminations, _, _ = env.step(np.array([NOP, 0, NOP]))
-    with pytest.raises(gymnasium.error.ResetNeeded, match=r"\[0 2\] have ended"):
+    before, _, terminations, _, _ = env.step(np.array([NOP, 0, NOP]))
+    with pytest.raises(ResetNeeded, match=r"\[0 2\] have ended"):
         env.step(np.zeros(3, int))
-    after, _ = env.reset(options={"reset_mask": terminations})
-    assert (after[1] == observations[1]).all()
-    assert (after[[0, 2]] != observations[[0, 2]]).any(axis=1).all()
+    after, _ = env.reset(options={"reset_mask": kind(terminations.tolist())})
+    assert list((after != before).any(axis=1)) == [True, False, True]
     assert not env.step(np.zeros(3, int))[2].any()
-    with pytest.raises(ValueError, match=r"reset_mask = .*must hold 3 booleans"):
-        env.reset(options={"reset_mask": np.ones(2, bool)})
-    with pytest.raises(ValueError, match=r"reset_mask = \[1, 0, 1\]: must hold 3 booleans"):
-        env.reset(options={"reset_mask": [1, 0, 1]})
 
 
-def test_the_mdp_is_an_input_of_the_programs(starts):
+def test_the_mdp_is_an_input_of_the_programs(make):
     mdp = small.small_mdp()
     # The classes swap their detections.
-    bank = jax.tree.map(lambda features: features[::-1], mdp.looks)
+    other = dataclasses.replace(mdp, looks=jax.tree.map(lambda x: x[::-1], mdp.looks))
     seen, programs = [], []
-    for each in (mdp, dataclasses.replace(mdp, looks=bank)):
-        env = MapVectorEnv(each, LIDAR, 4, starts)
+    for each in (mdp, other):
+        env = MapVectorEnv(each, LIDAR, 3, make.keywords["starts"])
         env.reset(seed=3)
-        seen.append(env.step(np.zeros(4, int))[0])
+        seen.append(env.step(np.zeros(3, int))[0])
         programs.append((ours._start._cache_size(), ours._step._cache_size()))
     assert programs[0] == programs[1]
     assert np.any(seen[0] != seen[1])
 
 
-def test_a_mask_may_be_a_list(starts):
-    env = MapVectorEnv(small.small_mdp(), LIDAR, 3, starts, "Disabled")
-    env.reset(seed=0)
-    before = env.step(np.array([NOP, 0, NOP]))[0]
-    after, _ = env.reset(options={"reset_mask": [True, False, True]})
-    assert list((after != before).any(axis=1)) == [True, False, True]
-    assert not env.step(np.zeros(3, int))[2].any()
-
-
-def test_seeds_repeat_and_differ(starts):
-    env = MapVectorEnv(small.small_mdp(), LIDAR, 8, starts)
+def test_seeds_repeat_and_differ(make):
+    env = make(num_envs=3)
 
     def play(**reset):
         seen = [env.reset(**reset)[0]]
-        seen += [env.step(np.full(8, action))[0] for action in (0, 1, NOP, 2)]
+        seen += [env.step(np.full(3, action))[0] for action in (0, 1, NOP, 2)]
         return np.stack(seen)
 
     first, again, other, later = play(seed=1), play(seed=1), play(seed=2), play()
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
     assert (other[0] != later[0]).any()
-    assert first.dtype == np.float32
-    assert env.observation_space.contains(first[0])
     # What it gives is the caller's to change.
     first[0] += 1.0
 
 
-def test_wrappers_of_gymnasium_take_it(starts):
-    env = RecordEpisodeStatistics(MapVectorEnv(small.small_mdp(), LIDAR, 2, starts))
+def test_wrappers_of_gymnasium_take_it(make):
+    env = RecordEpisodeStatistics(make(num_envs=3))
     env.reset(seed=0)
-    total = env.step(np.array([0, 1]))[1][0]
-    *_, infos = env.step(np.array([NOP, 2]))
+    total = env.step(np.array([0, 1, 1]))[1][0]
+    *_, infos = env.step(np.array([NOP, 2, 2]))
     assert infos["episode"]["l"][0] == 2
     assert infos["episode"]["r"][0] == pytest.approx(total)
 
 
-def test_what_cannot_be_is_told(starts):
-    mdp = small.small_mdp()
-    with pytest.raises(ValueError, match="modality = 2: must be a whole number from 0 to 1"):
-        MapVectorEnv(mdp, 2, 2)
-    with pytest.raises(ValueError, match="autoreset_mode = 'Sometimes': must be one of NextStep, "):
-        MapVectorEnv(mdp, 0, 2, autoreset_mode="Sometimes")
-    env = MapVectorEnv(mdp, LIDAR, 2, starts)
-    with pytest.raises(gymnasium.error.ResetNeeded, match="before reset"):
-        env.step(np.zeros(2, int))
-    env.reset(seed=0)
-    for actions in (np.array([0, 4]), np.array([-1, 0]), np.zeros(3, int)):
-        with pytest.raises(ValueError, match="must be integers in MultiDiscrete"):
-            env.step(actions)
+def test_every_task_is_registered():
+    for name in jaxsense.registered():
+        spec = gymnasium.spec(f"jaxsense/{name}")
+        assert spec.kwargs == {"task": name}
+        assert json.loads(spec.to_json())["id"] == f"jaxsense/{name}"
+    envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=3, agent="lidar", starts=8)
+    assert isinstance(envs, MapVectorEnv)
+
+
+@pytest.mark.parametrize("name", ["map-v0", pytest.param("team-v0", marks=pytest.mark.slow)])
+def test_gymnasiums_own_check_passes_without_a_warning(name):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(gymnasium.make(f"jaxsense/{name}", render_mode="rgb_array").unwrapped)
+
+
+def test_pictures_show_what_changes():
+    envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=2, render_mode="rgb_array")
+    assert envs.metadata["render_fps"] == 2
+    with pytest.raises(ResetNeeded):
+        envs.render()
+    envs.reset(seed=3)
+    before = envs.render()
+    assert [(x.shape, x.dtype) for x in before] == [((400, 800, 3), np.uint8)] * 2
+    envs.step(np.array([0, NOP]))  # the second episode ends
+    after = envs.render()
+    assert all(np.any(x != y) for x, y in zip(before, after, strict=True))
+    assert envs._actions == [[0], [NOP]]
+    envs.step(np.array([1, 0]))  # and starts anew
+    assert envs._actions == [[0, 1], []]
+    env = gymnasium.make("jaxsense/map-v0", render_mode="rgb_array")
+    env.reset(seed=3)
+    assert env.render().shape == (400, 800, 3)
+    assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
+
+
+def test_a_forked_process_is_told_to_spawn(monkeypatch):
+    monkeypatch.setattr(common, "_processes", set())
+    env = gymnasium.make("jaxsense/map-v0")
+    monkeypatch.setattr(common.os, "getpid", lambda: -1)  # as in a process forked from this one
+    with pytest.raises(RuntimeError, match=r"was forked .*: start processes with spawn, as vector"):
+        env.reset(seed=0)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:os.fork", "ignore:.*ERROR")
+def test_asynchronous_environments_of_gymnasium_do_not_hang():
+    make_vec = functools.partial(
+        gymnasium.make_vec, "jaxsense/map-v0", 2, vectorization_mode="async"
+    )
+    envs = make_vec(vector_kwargs={"context": "fork"})
+    with pytest.raises(RuntimeError, match="was forked"):
+        envs.reset(seed=0)
+    envs.close(terminate=True)
+    envs = make_vec(vector_kwargs={"context": "spawn"})
+    assert envs.reset(seed=0)[0].shape == (2, 12)
+    envs.close()
+
+
+def test_what_cannot_be_is_told(make):
+    env = make(num_envs=3)
+    with pytest.raises(ResetNeeded, match="before reset"):
+        env.step(np.zeros(3, int))
+    with pytest.raises(ValueError, match="render_mode = 'ansi': must be one of"):
+        ours.TaskEnv("map-v0", render_mode="ansi")
+    with pytest.raises(ConfigError, match="agent = 'sonar': must be one of camera, lidar"):
+        gymnasium.make("jaxsense/map-v0", agent="sonar")
+    with pytest.raises(ValueError, match="modality = 0: must be None with a task"):
+        MapVectorEnv(jaxsense.make("map-v0"), 0)

@@ -1,4 +1,4 @@
-"""The gymnax form: the MDP's own functions behind gymnax 1.x."""
+"""gymnax: parameters, prepared starts, batches and wrappers; `test_parity` has the steps."""
 
 import jax
 import jax.numpy as jnp
@@ -8,16 +8,17 @@ import small
 
 pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
 
+import gymnax
 from gymnax.wrappers import purerl
 from gymnax.wrappers.gym import GymnaxToGymWrapper
 
-from jaxsense import make
-from jaxsense.dqn import map_mdp, observation
+import jaxsense
+from jaxsense.dqn import observation
 from jaxsense.interfaces.gymnax import MapEnv
 from jaxsense.looks import make_mdp
 from jaxsense.models import init
 
-LIDAR = 1
+LIDAR, NOP = 1, 3
 
 
 @pytest.fixture(scope="module")
@@ -25,47 +26,27 @@ def env():
     return MapEnv(small.small_mdp(), LIDAR)
 
 
-def assert_trees_equal(actual, expected):
-    jax.tree.map(np.testing.assert_array_equal, actual, expected)
+@pytest.fixture(scope="module")
+def params(env):
+    return env.prepared_params(jax.random.key(2), 5)
 
 
-def test_every_step_equals_the_mdps(env):
-    params = env.default_params
-    obs, state = env.reset(jax.random.key(0), params)
-    expected = jax.jit(lambda key: map_mdp.reset(key, small.small_mdp()))(jax.random.key(0))
-    mdp_step = jax.jit(lambda k, s, a: map_mdp.step(k, small.small_mdp(), s, a, LIDAR))
-    for i, action in enumerate([0, 1, 0, 2, 3]):
-        np.testing.assert_allclose(obs, observation(expected.belief), rtol=1e-6)
-        assert_trees_equal(state.map.seen, expected.seen)
-        key = jax.random.key(10 + i)
-        obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
-        expected, outcome = mdp_step(jax.random.split(key)[0], expected, jnp.int32(action))
-        np.testing.assert_allclose(reward, outcome.reward, rtol=1e-5)
-        assert (terminated, truncated) == (outcome.terminated, outcome.truncated)
-        final = observation(expected.belief)
-        np.testing.assert_allclose(info["final_observation"], final, rtol=1e-6)
-        assert info["discount"] == 1.0 - outcome.terminated
-    assert terminated
-    start, _ = env.reset(jax.random.split(key)[1], params)
-    np.testing.assert_allclose(obs, start, rtol=1e-6)
-    assert not state.terminated
-    assert state.time == 0
-
-
-def test_params_say_when_an_episode_is_truncated(env):
-    params = env.default_params.replace(max_steps_in_episode=2)
+def test_params_say_when_an_episode_is_truncated(env, params):
+    assert params.max_steps_in_episode == small.CONFIG.mdp.max_steps
+    params = params.replace(max_steps_in_episode=2)
     _, state = env.reset(jax.random.key(0), params)
-    for expected in (False, True, False, True):
-        _, state, _, terminated, truncated, _ = env.step(jax.random.key(1), state, 0, params)
-        assert (terminated, truncated) == (False, expected)
-    _, state, _, _, _, _ = env.step(jax.random.key(1), state, 0, params)
-    terminated, truncated = env.step(jax.random.key(1), state, env.num_actions - 1, params)[3:5]
-    assert (terminated, truncated) == (True, False)
-    assert env.default_params.max_steps_in_episode == small.CONFIG.mdp.max_steps
+    cases = [(0, False, False), (0, False, True), (0, False, False), (NOP, True, False)]
+    for action, *expected in cases:
+        key = jax.random.key(action)
+        seen, state, _, *ended, info = env.step(key, state, action, params)
+        assert ended == expected
+        assert info["discount"] == 1.0 - any(expected[:1])
+        assert (state.time == 0) == any(expected)
+    start, _ = env.reset(jax.random.split(key)[1], params)
+    np.testing.assert_allclose(seen, start, rtol=1e-6)
 
 
-def test_prepared_starts_are_drawn_and_no_others(env):
-    params = env.prepared_params(jax.random.key(2), 5)
+def test_prepared_starts_are_drawn_and_no_others(env, params):
     keys = jax.random.split(jax.random.key(3), 100)
     drawn, _ = jax.vmap(env.reset, (0, None))(keys, params)
     starts = jax.vmap(observation)(params.starts.belief)
@@ -74,36 +55,20 @@ def test_prepared_starts_are_drawn_and_no_others(env):
     assert (distances.min(axis=0) == 0).all()
 
 
-def test_a_batch_equals_single_environments(env):
-    params = env.prepared_params(jax.random.key(2), 16)
-    keys = jax.random.split(jax.random.key(3), 4)
-    actions = jnp.array([0, 1, 2, 3])
+def test_a_batch_equals_single_environments(env, params):
+    keys, actions = jax.random.split(jax.random.key(3), 4), jnp.arange(4)
     _, states = jax.vmap(env.reset, (0, None))(keys, params)
     together = jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
     for i in range(4):
-        state = jax.tree.map(lambda x: x[i], states)  # noqa: B023
-        alone = env.step(keys[i], state, actions[i], params)
-        jax.tree.map(
-            lambda x, y: np.testing.assert_allclose(x[i], y, atol=1e-5),  # noqa: B023
-            together,
-            alone,
-        )
+        alone = env.step(keys[i], jax.tree.map(lambda x: x[i], states), actions[i], params)  # noqa: B023
+        row = jax.tree.map(lambda x: x[i], together)  # noqa: B023
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), row, alone)
 
 
-def test_spaces_tell_what_is_given(env):
-    obs, state = env.reset(jax.random.key(0))
-    space = env.observation_space(env.default_params)
-    assert (space.shape, space.dtype) == (obs.shape, obs.dtype)
-    assert space.contains(obs)
-    assert env.action_space(env.default_params).n == env.num_actions == 4
-    assert state.time == 0
-
-
-def test_wrappers_of_gymnax_take_it(env):
-    params = env.prepared_params(jax.random.key(2), 4)
+def test_wrappers_of_gymnax_take_it(env, params):
     logged = purerl.LogWrapper(env)
     _, state = logged.reset(jax.random.key(0), params)
-    *_, info = logged.step(jax.random.key(1), state, env.num_actions - 1, params)
+    *_, info = logged.step(jax.random.key(1), state, NOP, params)
     assert info["returned_episode_lengths"] == 1
     single = GymnaxToGymWrapper(env, params)
     obs, _ = single.reset(seed=0)
@@ -111,11 +76,15 @@ def test_wrappers_of_gymnax_take_it(env):
     assert single.step(single.action_space.n - 1)[2]
 
 
-def test_its_name_is_that_of_the_task(env):
-    assert MapEnv(make("many-v0")).name == "many-v0"
-    assert env.name == "jaxsense-Map"
+def test_every_task_is_registered(env):
+    assert set(jaxsense.registered()) <= set(gymnax.registered_envs)
+    made, params = gymnax.make("map-v0", agent="lidar")
+    assert (made.played.agent, made.name) == ("lidar", "map-v0")
+    assert params.max_steps_in_episode == jaxsense.make("map-v0").max_steps
+    assert (env.name, env.num_actions) == ("jaxsense-Map", NOP + 1)
 
 
+@pytest.mark.slow
 def test_live_observations_trace():
     def play(key):
         env = MapEnv(make_mdp(small.CONFIG, init(key, small.CONFIG)).map, 0)
@@ -126,21 +95,15 @@ def test_live_observations_trace():
     assert (obs.shape, reward.shape) == ((12,), ())
 
 
-@pytest.mark.parametrize("modality", [-1, 2])
-def test_a_sensor_that_is_not_there_is_named(modality):
-    with pytest.raises(ValueError, match=f"modality = {modality}: must be a whole number"):
-        MapEnv(small.small_mdp(), modality)
-
-
-@pytest.mark.parametrize("action", [1.7, jnp.float32(1), np.array([0, 1])])
-def test_an_action_that_is_no_integer_is_refused(env, action):
-    _, state = env.reset(jax.random.key(0))
+@pytest.mark.parametrize("action", [1.7, np.array([0, 1])])
+def test_an_action_that_is_no_integer_is_refused(env, params, action):
+    _, state = env.reset(jax.random.key(0), params)
     with pytest.raises(ValueError, match="action"):
-        env.step(jax.random.key(1), state, action)
+        env.step(jax.random.key(1), state, action, params)
 
 
-@pytest.mark.parametrize("action", [2, np.int64(2), np.uint8(2), jnp.int32(2)])
-def test_integers_of_all_libraries_are_the_same_action(env, action):
-    _, state = env.reset(jax.random.key(0))
-    after = env.step_env(jax.random.key(1), state, action, env.default_params)[1]
+@pytest.mark.parametrize("action", [2, np.uint8(2)])
+def test_integers_of_all_libraries_are_the_same_action(env, params, action):
+    _, state = env.reset(jax.random.key(0), params)
+    after = env.step_env(jax.random.key(1), state, action, params)[1]
     assert after.map.seen[2, LIDAR]

@@ -4,7 +4,6 @@ import importlib.util
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from jaxsense import export
@@ -52,10 +51,3 @@ def test_examples_of_tasks_run(package, capsys):
     exec(compile(TASKS[package], PAGE.name, "exec"), {})
     (printed,) = re.findall(r"^print\(.*\)  # ([^;\n]*)", TASKS[package], re.MULTILINE)
     assert capsys.readouterr().out == f"{printed}\n"
-
-
-def test_detections_are_of_the_classes_that_they_are_stored_under(names):
-    bank = names["bank"].features
-    assert [x.shape for x in bank] == [(3, 64, 2)] * 2
-    labels = np.array(names["config"].arena.label_of_class("colour"))
-    np.testing.assert_array_equal(np.argmax(bank[0], axis=-1), np.tile(labels[:, None], 64))

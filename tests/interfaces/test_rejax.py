@@ -1,35 +1,18 @@
-"""rejax 0.1.3, unmodified, trains on the form of five values."""
+"""rejax 0.1.3, unmodified, trains; `test_parity` has the steps."""
 
 import jax
-import numpy as np
 import pytest
 import small
 
-pytest.importorskip("gymnax", reason="needs the extra jaxsense[gymnax]")
+pytest.importorskip("rejax", reason="rejax: needs the extra jaxsense[rejax]")
+
+import rejax
 
 from jaxsense.dqn import observation
-from jaxsense.interfaces import gymnax
 from jaxsense.interfaces.rejax import MapEnv
 
 
-@pytest.mark.slow
-def test_a_step_is_that_of_gymnax_with_five_values():
-    ours, theirs = MapEnv(small.small_mdp(), 0), gymnax.MapEnv(small.small_mdp(), 0)
-    params = ours.default_params.replace(max_steps_in_episode=2)
-    obs, state = ours.reset(jax.random.key(0), params)
-    np.testing.assert_array_equal(obs, theirs.reset(jax.random.key(0), params)[0])
-    endings = []
-    for action in (0, 3, 1, 1):
-        key = jax.random.key(action)
-        expected = theirs.step(key, state, action, params)
-        obs, state, reward, done, _ = ours.step(key, state, action, params)
-        jax.tree.map(np.testing.assert_array_equal, (obs, state, reward), expected[:3])
-        endings.append(bool(done))
-    assert endings == [False, True, False, True]
-
-
 def test_its_dqn_reaches_95_percent_of_the_optimal_return():
-    rejax = pytest.importorskip("rejax", reason="rejax: needs the extra jaxsense[rejax]")
     env = MapEnv(small.small_mdp(), 0)
     algorithm = rejax.DQN.create(
         env=env,

@@ -1,7 +1,6 @@
-"""The team behind all interfaces for several agents, without any of their libraries."""
+"""The team of which each robot is an agent, behind jaxmarl and PettingZoo."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,82 +8,144 @@ import numpy as np
 import pytest
 import small
 
-from jaxsense import looks
-from jaxsense.interfaces import team
+import jaxsense
+from jaxsense.config import ConfigError
+from jaxsense.dqn import team_mdp
+from jaxsense.interfaces import common
+from jaxsense.interfaces.common import robots_of
 
+AGENTS = ("camera_1", "camera_2", "lidar")
 NOP = 4
 
 
-start = jax.jit(lambda key, mdp: team.robots_of(mdp, small.TEAM).start(key))
-step = jax.jit(team.step)
+@pytest.fixture(scope="module")
+def robots():
+    return robots_of(small.team(), small.TEAM)
 
 
-def at_the_limit(number):
-    """Two cameras and a LiDAR, before the last of so many choices."""
-    config = dataclasses.replace(small.team().config, max_steps=number)
-    mdp = dataclasses.replace(small.team(), config=config)
-    act = functools.partial(step, jax.random.key(1), mdp)
-    state = start(jax.random.key(0), mdp)
-    for _ in range(number - 1):
-        state, outcome = act(state, jnp.zeros(3, int))
-        assert not outcome.truncated.any()
-    return state, act
+@jax.jit
+def reset(key, robots):
+    return robots.reset(key)
 
 
-@pytest.mark.slow
-def test_a_robot_that_chose_nop_at_the_limit_is_done_and_not_cut():
-    state, act = at_the_limit(1)
-    _, outcome = act(state, jnp.full(3, NOP))
-    np.testing.assert_array_equal(outcome.terminated, [True, False, False])
-    np.testing.assert_array_equal(outcome.truncated, [False, True, True])
+@jax.jit
+def step(key, robots, state, actions):
+    return robots.step(key, state, actions)
 
 
-def test_all_that_work_are_cut_at_the_limit():
-    state, act = at_the_limit(3)
-    _, outcome = act(state, jnp.zeros(3, int))
-    np.testing.assert_array_equal(outcome.terminated, [False] * 3)
-    np.testing.assert_array_equal(outcome.truncated, [True] * 3)
+def with_limit(robots, number):
+    config = dataclasses.replace(robots.mdp.config, max_steps=number)
+    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, config=config))
 
 
-def test_the_end_of_all_at_the_limit_is_no_cut():
-    state, act = at_the_limit(3)
-    state = dataclasses.replace(
-        state, team=dataclasses.replace(state.team, works=jnp.arange(3) == state.agent)
+def test_the_whole_team_starts_and_is_never_alone(robots):
+    assert robots.names == AGENTS
+    assert robots.modality == ("camera", "camera", "lidar")
+    one_each = robots_of(small.team(), dataclasses.replace(small.TEAM, robots=None))
+    assert one_each.names == ("camera", "lidar")
+    keys = jax.random.split(jax.random.key(1), 64)
+    states = jax.jit(jax.vmap(robots.reset))(keys)
+    assert states.team.works.all()
+    assert states.asks.all()
+    np.testing.assert_array_equal(states.team.modality, [[0, 0, 1]] * 64)
+    # Robots and PoIs are at places of their own: `TeamConfig.alone` is 1 in these settings.
+    assert len(np.unique(states.team.poses[:, :, 0])) == 64 * 3
+    assert len(np.unique(states.team.positions[:, :, 0])) > 64
+    assert set(np.asarray(states.team.present.sum(axis=1))) == {1, 2, 3, 4}
+
+
+def test_every_step_equals_the_mdps(robots):
+    mdp = robots.mdp
+    mdp_step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
+    observe = jax.jit(
+        lambda s, r: team_mdp.observation(mdp.config.travel, s.map.belief, s.team, r, 2)
     )
-    _, outcome = act(state, jnp.full(3, NOP))
-    np.testing.assert_array_equal(outcome.terminated, [True] * 3)
-    np.testing.assert_array_equal(outcome.truncated, [False] * 3)
+    state = expected = reset(jax.random.key(3), robots)
+    turns, looks = [], 0
+    for i in range(11):
+        agent = int(expected.agent)
+        turns.append(agent)
+        present = np.asarray(expected.team.present)
+        for r, mask in enumerate(robots.action_mask(state)):
+            np.testing.assert_array_equal(mask, [*(present & (r == agent)), True])
+        # PoIs in turn; the lidar ends its part with its third choice.
+        pois = np.flatnonzero(present)
+        action = NOP if (agent, i) == (2, 8) else int(pois[i % len(pois)])
+        actions = jnp.full(3, NOP).at[agent].set(action)
+        state, found, seconds = step(jax.random.key(i), robots, state, actions)
+        expected, outcome = mdp_step(jax.random.key(i), expected, jnp.int32(action))
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), state, expected)
+        assert seconds == pytest.approx(float(outcome.seconds))
+        looks += seconds > 0
+        # 0.125 a second for each robot that works; only the robot that has looked is rewarded.
+        works = np.asarray(expected.team.works)
+        own = np.where(np.arange(3) == int(expected.agent), float(outcome.reward), 0.0)
+        np.testing.assert_allclose(found.reward, own - 0.125 * float(seconds) * works, atol=1e-5)
+        np.testing.assert_array_equal(found.terminated, ~works)
+        assert not found.truncated.any()
+        for r, seen in enumerate(found.observation):
+            np.testing.assert_allclose(seen, observe(expected, r).reshape(-1), atol=1e-5)
+    # All three choose at the start, and then whoever has looked.
+    assert turns[:3] == [0, 1, 2]
+    assert looks > 5
 
 
-@pytest.mark.parametrize("actions", [np.array([0, 0, 5]), np.array([0.0, 0.0, 0.0])])
-def test_actions_that_do_not_exist_are_refused(actions):
-    state = start(jax.random.key(0), small.team())
+def test_actions_of_the_others_and_absent_pois_do_nothing(robots):
+    states = [reset(key, robots) for key in jax.random.split(jax.random.key(4), 16)]
+    state = min(states, key=lambda state: int(state.team.present.sum()))
+    assert list(state.team.present) == [True, False, False, False]
+
+    def after(*actions):
+        return step(jax.random.key(5), robots, state, jnp.array(actions))
+
+    quiet, ended = after(0, NOP, NOP), after(NOP, NOP, NOP)
+    for same, actions in ((quiet, (0, 0, 3)), (ended, (2, NOP, NOP))):
+        jax.tree.map(np.testing.assert_array_equal, after(*actions), same)
+    assert ended[1].terminated.tolist() == [True, False, False]
+    assert not quiet[1].terminated.any()
+
+
+@pytest.mark.parametrize(
+    ("works", "action", "terminated", "truncated"),
+    [
+        ([True] * 3, 0, [False] * 3, [True] * 3),
+        ([True] * 3, NOP, [False, False, True], [True, True, False]),
+        # The end of all at the limit is no cut.
+        ([False, False, True], NOP, [True] * 3, [False] * 3),
+    ],
+)
+def test_robots_that_would_go_on_at_the_limit_are_cut(robots, works, action, terminated, truncated):
+    robots = with_limit(robots, 3)
+    state = reset(jax.random.key(0), robots)
+    for _ in range(2):
+        state, found, _ = step(jax.random.key(1), robots, state, jnp.zeros(3, int))
+        assert not found.truncated.any()
+    assert state.agent == 2
+    state = dataclasses.replace(state, team=dataclasses.replace(state.team, works=jnp.array(works)))
+    _, found, _ = step(jax.random.key(1), robots, state, jnp.full(3, action))
+    assert (found.terminated.tolist(), found.truncated.tolist()) == (terminated, truncated)
+
+
+@pytest.mark.parametrize("action", [-3, 5, 0.7])
+def test_actions_that_do_not_exist_are_refused_or_reward_nan(robots, action):
+    state = reset(jax.random.key(0), robots)
     with pytest.raises(ValueError, match=r"actions"):
-        team.step(jax.random.key(1), small.team(), state, jnp.asarray(actions))
+        robots.step(jax.random.key(1), state, jnp.full(3, action))
+    if isinstance(action, int):
+        for _ in AGENTS:  # the first look comes after all have chosen
+            state, found, _ = step(jax.random.key(4), robots, state, jnp.full(3, action))
+        assert np.isnan(found.reward).any()
 
 
-@pytest.mark.slow
-def test_classes_and_scans_of_detections_are_drawn_from_keys_of_their_own(monkeypatch):
-    """With one key for both, the order of the classes and the first scene would be related."""
-    keys, balanced, survey = {}, looks.balanced_classes, looks.surveys
-
-    def classes_of(key, config, number):
-        jax.debug.callback(lambda x: keys.update(classes=x), jax.random.key_data(key))
-        each = jax.random.split(key, number)
-        jax.debug.callback(lambda x: keys.update(split=x), jax.random.key_data(each))
-        return balanced(key, config, number)
-
-    def surveys_of(of_scenes, world, classes):
-        jax.debug.callback(lambda x: keys.update(scenes=x), jax.random.key_data(of_scenes))
-        return survey(of_scenes, world, classes)
-
-    monkeypatch.setattr(looks, "balanced_classes", classes_of)
-    monkeypatch.setattr(looks, "surveys", surveys_of)
-    models = small.init(jax.random.key(0), small.CONFIG)
-    key = jax.random.key(1)
-    jax.block_until_ready(looks.detections(key, small.CONFIG, models, 4))
-    jax.effects_barrier()
-    rows = [keys["classes"][None], keys["split"], keys["scenes"], jax.random.key_data(key)[None]]
-    found = np.concatenate(rows)
-    assert len(keys["scenes"]) >= 4
-    assert len(np.unique(found, axis=0)) == len(found)
+def test_what_is_no_team_is_named():
+    with pytest.raises(ConfigError, match="name = 'map-v0': must be a task of a team"):
+        robots_of("map-v0")
+    with pytest.raises(ValueError, match="config: must be None with a task"):
+        robots_of(jaxsense.make("team-v0"), jaxsense.PRESETS["team"])
+    # In another order a robot would carry another's sensor.
+    other = dataclasses.replace(small.team(), modalities=("lidar", "camera"))
+    cameras = small.ONLY_CAMERAS
+    for mdp, config in ((small.team(), cameras), (other, small.TEAM), (small.team().map, cameras)):
+        with pytest.raises(ValueError, match=r"mdp = .*MapMdp|TeamMdp .*: must be a TeamMdp with"):
+            robots_of(mdp, config)
+    assert common.robots_of("team-v0").names == ("camera", "lidar")

@@ -1,6 +1,5 @@
 """A robot of the node for ROS 2 with programs that remember what they were asked."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -61,8 +60,8 @@ def see(ros2, robot, pose, angles=OWN, readings=None, age=0.0):
     """The look of a robot that arrives at a pose, and stands still in the second scan."""
     readings = np.full(len(angles), 1.0) if readings is None else np.asarray(readings)
     scan = ros2.Scan(9.0 - age, np.asarray(pose, float), angles, readings)
-    before = [dataclasses.replace(scan, stamp=scan.stamp - ago) for ago in (0.2, 0.1)]
-    robot.see(9.0, dataclasses.replace(before[0], pose=scan.pose + 1))
+    before = [scan._replace(stamp=scan.stamp - ago) for ago in (0.2, 0.1)]
+    robot.see(9.0, before[0]._replace(pose=scan.pose + 1))
     first, second = [robot.see(9.0, each) for each in (before[1], scan)]
     assert first is None
     return second

@@ -1,18 +1,23 @@
-"""What robots of the node for ROS 2 tell each other, and what the node publishes and logs."""
+"""What robots tell each other, what the node publishes and logs, and its program."""
 
 import copy
 import json
 import math
 import re
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from ros2_messages import LaserScan
 from ros2_robot import CONTENTS, OWN, POSITIONS, arrive, see
+from test_ros2_readings import scan_of
+
+import jaxsense
+from jaxsense import export, sim
 
 
 def test_robots_tell_each_other_their_looks(ros2, robot, stub):
@@ -26,48 +31,44 @@ def test_robots_tell_each_other_their_looks(ros2, robot, stub):
         assert np.isfinite(hears.known["looked_from"][0, 1]).all(axis=1).sum() == 1
     np.testing.assert_allclose(other.team["poses"][1], goal, atol=1e-6)
     assert other.team["target"].tolist() == [3, 0]
-    assert other.team["works"].tolist() == [True, True]
-    # A robot that says nothing for five seconds has failed; one that never spoke is not there.
-    other.choose(6.0, np.zeros(3))
-    assert other.team["works"].tolist() == [True, True]
-    other.choose(6.1, np.zeros(3))
-    assert other.team["works"].tolist() == [True, False]
     assert robot.team["works"].tolist() == [False, True]
+    # A robot that says nothing for five seconds has failed; one that never spoke is not there.
+    for now, works in ((6.0, True), (6.1, False)):
+        other.decide(now)
+        assert other.team["works"].tolist() == [True, works]
 
 
 LOOK = {"poi": 2, "features": [0.75, 0.25], "weight": 1.0, "place": [-1.1, 0.0]}
 REPORT = {"robot": 0, "pose": [1, 1, 0], "target": 1, "works": True, "look": LOOK}
-MALFORMED = {
-    "": "JSONDecodeError",
-    "[" * 100_000: "RecursionError",
-    "[]": "TypeError",
-    "{}": "KeyError('robot')",
-    json.dumps({**REPORT, "robot": 2}): "robot = 2: must be an integer from 0 to 1",
-    json.dumps({**REPORT, "robot": -1}): "robot = -1: must be an integer from 0 to 1",
-    json.dumps({**REPORT, "pose": [1, 1]}): "pose = [1, 1]: must be finite numbers of shape (3,)",
-    json.dumps({**REPORT, "pose": [1, 1, math.nan]}): "pose = [1, 1, nan]: must be finite",
-    json.dumps({**REPORT, "target": 4}): "target = 4: must be an integer from 0 to 3",
-    json.dumps({**REPORT, "look": {**LOOK, "poi": -1}}): "poi = -1: must be an integer from 0 to 2",
-    json.dumps({**REPORT, "look": {**LOOK, "place": [0]}}): "place = [0]: must be finite numbers",
-    json.dumps({**REPORT, "look": {**LOOK, "weight": None}}): "weight = None: must be finite",
-    json.dumps({**REPORT, "works": "false"}): "KeyError('false')",
-    json.dumps({**REPORT, "look": {**LOOK, "weight": 7}}): "weight = 7.0: must be from 0 to 1",
-    json.dumps(
-        {**REPORT, "look": {**LOOK, "features": [math.inf, 0]}}
-    ): "features = [inf, 0]: must",
-    json.dumps({**REPORT, "look": {**LOOK, "features": [1, 0, 0]}}): "of shape (2,)",
-    json.dumps(
-        {**REPORT, "look": {**LOOK, "features": [2, -1]}}
-    ): "features = [2.0, -1.0]: must be from 0 to 1",
-}
 
 
-@pytest.mark.parametrize("report", MALFORMED, ids=MALFORMED.values())
-def test_a_message_that_is_no_report_changes_nothing(robot, report):
-    before = copy.deepcopy((robot.team, robot.known, robot._heard_at))
-    with pytest.raises(ValueError, match=re.escape(MALFORMED[report])):
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ("", "JSONDecodeError"),
+        ("[" * 100_000, "RecursionError"),
+        ("[]", "TypeError"),
+        ("{}", "KeyError('robot')"),
+        ({"robot": 2}, "robot = 2: must be an integer from 0 to 1"),
+        ({"robot": -1}, "robot = -1: must be"),
+        ({"pose": [1, 1]}, "pose = [1, 1]: must be finite numbers of shape (3,)"),
+        ({"pose": [1, 1, math.nan]}, "pose = [1, 1, nan]: must be finite"),
+        ({"target": 4}, "target = 4: must be an integer from 0 to 3"),
+        ({"works": "false"}, "works = 'false': must be true or false"),
+        ({"look": {**LOOK, "poi": True}}, "poi = True: must be an integer from 0 to 2"),
+        ({"look": {**LOOK, "place": [0]}}, "place = [0]: must be finite numbers"),
+        ({"look": {**LOOK, "weight": None}}, "weight = None: must be finite"),
+        ({"look": {**LOOK, "weight": 7}}, "weight = 7: must be from 0 to 1"),
+        ({"look": {**LOOK, "features": [1, 0, 0]}}, "of shape (2,)"),
+        ({"look": {**LOOK, "features": [2, -1]}}, "features = [2, -1]: must be from 0 to 1"),
+    ],
+)
+def test_a_message_that_is_no_report_changes_nothing(robot, change, reason):
+    report = change if isinstance(change, str) else json.dumps({**REPORT, **change})
+    before = copy.deepcopy((robot.team, robot.known, robot.heard_at))
+    with pytest.raises(ValueError, match=re.escape(reason)):
         robot.hear(1.0, report)
-    jax.tree.map(np.testing.assert_array_equal, (robot.team, robot.known, robot._heard_at), before)
+    jax.tree.map(np.testing.assert_array_equal, (robot.team, robot.known, robot.heard_at), before)
 
 
 @pytest.fixture
@@ -76,6 +77,8 @@ def node(monkeypatch):
     for name in ("geometry_msgs", "rclpy", "sensor_msgs", "std_msgs", "tf2_ros"):
         for part in ("", ".duration", ".msg", ".qos", ".time"):
             monkeypatch.setitem(sys.modules, name + part, MagicMock())
+    sys.modules["rclpy.time"].Time.from_msg.return_value.nanoseconds = 10**9
+    sys.modules["tf2_ros"].TransformException = OSError
     node = MagicMock()
     node.get_clock().now().nanoseconds = 10**9
     return node
@@ -89,50 +92,102 @@ def callback_of(node, topic):
 
 def test_a_coarse_scan_gets_one_line_and_no_goal(ros2, robot, node, monkeypatch):
     monkeypatch.setattr(ros2, "pose_of", lambda *_: (np.zeros(3), False))
-    sys.modules["rclpy.time"].Time.from_msg.return_value.nanoseconds = 10**9
-    sys.modules["tf2_ros"].TransformException = OSError
     ros2.connect(node, robot)
     on_scan, goals = callback_of(node, "scan"), node.create_publisher.return_value
+    goal = sys.modules["geometry_msgs.msg"].PoseStamped.return_value
     for step, number in ((math.radians(35), 0), (OWN[1] - OWN[0], 1)):
-        scan = LaserScan(OWN[0], step, np.ones(9))
-        scan.header = MagicMock()
-        on_scan(scan)
+        header = {"angle_min": OWN[0], "angle_max": OWN[0] + 8 * step, "angle_increment": step}
+        on_scan(scan_of(np.ones(9), header=MagicMock(), **header))
         assert goals.publish.call_count == number
     (said,) = node.get_logger().error.call_args_list
-    assert "ignores the scans: step between beams = 35.00 degrees" in said.args[0]
-    assert said.kwargs == {"once": True}
-
-
-def test_the_node_logs_what_goes_wrong_and_says_what_stands_where(ros2, robot, stub, node):
-    stub.detects, goal = False, arrive(robot)
-    for stub.is_known in (True, False, True):
-        assert see(ros2, robot, goal) is None
-        goal = arrive(robot, goal)
-    stub.choices = [3]
-    robot._has_news = True
-    arrive(robot)
-    ros2.log(node, robot)
+    assert "ignores the scans: step of beams = 35.00 degrees" in said.args[0]
+    assert (goal.pose.position.x, goal.pose.orientation.w) == pytest.approx((1.1, 1.0))
+    # It has not looked within a minute.
+    node.get_clock().now().nanoseconds = 62 * 10**9
+    on_scan(scan_of(np.ones(9), header=MagicMock(), **header))
     logged = [call.args[0] for call in node.get_logger().info.call_args_list]
-    assert logged[0] == "nothing detected of PoI 0, 0.90 m away"
-    assert logged[1] == "failure 1 of 3 at PoI 0"
-    assert logged[2] == "outside of what was recorded or learned: PoI 0, 0.90 m away"
-    assert logged[-2:] == ["gives PoI 0 up", "done: no further look is worth its cost"]
-    assert robot.notes == []
-    tell = ros2.join(node, robot, lambda: 1.0)
+    assert logged == ["has not looked within 60 s", "failure 1 of 3 at PoI 0"]
+    assert goals.publish.call_count == 2
+
+
+def test_the_node_hears_the_others_and_says_what_stands_where(ros2, robot, node):
+    tell, hear = ros2.join(node, robot, lambda: 1.0), callback_of(node, "team")
     robot.known["mean"][1] = 0.75
     string = sys.modules["std_msgs.msg"].String
     tell()
     (_, classes) = (json.loads(call.kwargs["data"]) for call in string.call_args_list[-2:])
     assert classes == [{"a": 0.0, "b": 1.0}, {"a": 0.75, "b": 0.25}, {"a": 0.0, "b": 1.0}]
-
-
-def test_a_message_that_is_no_report_does_not_end_the_node(ros2, robot, node):
-    ros2.connect(node, robot)
-    hear = callback_of(node, "team")
     hear(SimpleNamespace(data="nonsense"))
     (warned,) = node.get_logger().warning.call_args_list
     assert "ignored a message on `team`: no report of a robot" in warned.args[0]
-    assert warned.kwargs == {"once": True}
     hear(SimpleNamespace(data=json.dumps(REPORT)))
     assert robot.known["seen"][2, 0]
-    assert robot._heard_at[0] == pytest.approx(1)
+    assert robot.heard_at[0] == 1
+
+
+def test_the_program_reads_its_command_before_it_needs_ros(ros2, monkeypatch, capsys, tmp_path):
+    given = []
+    monkeypatch.setitem(ros2.sys.modules, "rclpy", None)
+
+    def code_of(*argv):
+        monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", *argv])
+        with pytest.raises(SystemExit) as stop:
+            ros2.main()
+        return stop.value.code
+
+    (text := tmp_path / "text.zip").write_text("no archive")
+    assert code_of(str(text), "--pois", "0,1") == 2
+    assert f"{text}: must be a file of `jaxsense export`" in capsys.readouterr().err
+    for poi in ("1.0", "1,2,3", "1;2", "-1"):
+        assert code_of("robot.zip", "--pois", poi, "0,1") == 2
+        assert "argument --pois: invalid point value" in capsys.readouterr().err
+    monkeypatch.setattr(ros2, "load", lambda archive: (archive, "programs"))
+    monkeypatch.setattr(ros2, "Robot", lambda *each: given.append(each))
+    pois, ros = ["1.0,0.5", "-1.2,0.8", "-.3,-1.1"], ["--ros-args", "-r", "scan:=/front/scan"]
+    ended = code_of("robot.zip", "--robot", "-1", "--pois", *pois, *ros)
+    assert ended == "needs ROS 2: source /opt/ros/.../setup.bash"
+    assert given == [(Path("robot.zip"), "programs", -1, [[1.0, 0.5], [-1.2, 0.8], [-0.3, -1.1]])]
+
+
+@pytest.mark.slow  # compiles scans in a simulated arena
+def test_a_team_of_nodes_finds_out_what_stands_where(ros2, tmp_path):
+    config, models = jaxsense.load_pretrained("default")
+    archive = tmp_path / "robot.zip"
+    archive.write_bytes(export.archive(config, models))
+    world, classes = sim.make_world(config), [2, 0, 1]
+    scene = sim.random_scene(jax.random.key(0), world, jnp.array(classes))
+    positions = np.asarray(scene.layout.position)
+    team = [ros2.Robot(*ros2.load(archive), robot, positions) for robot in range(2)]
+    poses, number = np.array(scene.poses, float), 0
+
+    @jax.jit
+    def scans(key, poses):
+        data = sim.place(world.arena, scene.layout, poses)
+        return [
+            sim.sensors.scan(
+                key, sensor, world.arena, data, scene.layout, scene.light, i, sensor.directions
+            )
+            for i, sensor in enumerate(world.sensors)
+        ]
+
+    while not all(each.is_done for each in team) and number < 40:
+        for i, robot in enumerate(team):
+            robot.choose(number, poses[i])
+            if robot.goal is None:
+                continue
+            poses[i] = robot.goal  # it arrives at once
+            readings = np.asarray(scans(jax.random.key(number), jnp.float32(poses))[i])
+            angles = world.sensors[i].angles
+            if robot.name == "lidar":  # from left to right, as some drivers have it
+                readings, angles = readings[::-1], angles[::-1]
+            looks = [
+                robot.see(stamp, ros2.Scan(stamp, poses[i].copy(), angles, readings))
+                for stamp in (number, number + 0.1)
+            ]
+            for other in team:
+                other.hear(number, robot.report(looks[1]))
+            number += 1
+    for robot in team:
+        assert robot.is_done
+        assert robot.classes("probabilities").argmax(axis=1).tolist() == classes
+    assert 6 >= number >= 4

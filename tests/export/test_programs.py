@@ -1,0 +1,286 @@
+"""Exported programs, against functions of jaxsense and rules by hand."""
+
+import dataclasses
+import io
+import json
+import zipfile
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import pytest
+from exporting import CONFIG, drawn
+
+import jaxsense
+from jaxsense import export
+from jaxsense.config import PRESETS, LocalisationConfig, SearchConfig
+from jaxsense.core.networks import MLP
+from jaxsense.core.types import Belief
+from jaxsense.dqn import observation, team_mdp
+from jaxsense.interfaces import robot
+from jaxsense.models import make_jmvae
+from jaxsense.run.version import __version__
+from jaxsense.sim import sensors
+from jaxsense.tasks.pretrained import PRETRAINED
+from jaxsense.vae import detectors, jmvae, latent
+
+BATCH = 12
+SIZES = {"pois": 3, "robots": 2, "looks": 4}
+
+
+@pytest.fixture(scope="module")
+def loaded(file):
+    return robot.load(file)
+
+
+def check(loaded, name, expected, *keys):
+    """`expected(*inputs of one example) -> outputs`; returns outputs of all examples."""
+    contents, programs = loaded
+    rng, rows = np.random.default_rng(0), []
+    for _ in range(BATCH):
+        given = drawn(rng, contents, name, SIZES)
+        rows.append(programs[name](**given))
+        assert {*rows[-1]} == {*contents["programs"][name]["outputs"]}
+        for key, value in zip(keys, expected(*given.values()), strict=True):
+            np.testing.assert_allclose(rows[-1][key], value, atol=1e-5, err_msg=f"{name}/{key}")
+    return rows
+
+
+@pytest.mark.parametrize("m", [0, 1])
+def test_programs_of_a_sensor_give_what_jaxsense_gives(models, loaded, m):
+    name, sensor = CONFIG.modalities[m], sensors.make(CONFIG)[m]
+    of_window = jax.jit(lambda window: detectors.detect(models.detectors[m], window))
+
+    def detect(readings, bearing, distance):
+        # The nearest window in the scan, ray by ray.
+        first = round(float(sensor.centre(bearing)) - (sensor.window - 1) * sensor.stride / 2)
+        rays = first + np.arange(sensor.window) * sensor.stride
+        window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
+        features = np.asarray(of_window(window))
+        return True, True, features.max() >= CONFIG.mission.least_confidence, features
+
+    @jax.jit
+    def write(mean, std, seen, features, weight):
+        after = models.fusion.update(Belief(mean, std), seen, features, m, weight)
+        return after.mean, after.std
+
+    @jax.jit
+    def weigh(apart):
+        return models.novelty.weight(apart, m), models.novelty.to_go(apart, m)
+
+    check(loaded, f"detect_{name}", detect, "is_known", "is_there", "detects", "features")
+    check(loaded, f"weigh_{name}", weigh, "weight", "to_go")
+    check(loaded, f"write_{name}", write, "new_mean", "new_std")
+
+
+@pytest.mark.parametrize("m", [0, 1])
+def test_a_detector_answers_what_is_not_there(loaded, m):
+    sensor, (_, programs) = sensors.make(CONFIG)[m], loaded
+    scan = np.full(sensor.shape, 0.5, np.float32)
+    torn = scan.copy()
+    torn[len(scan) // 2 :][:4] = np.nan  # the camera reads every fourth pixel
+    cases = [
+        (scan, 0.0, 1.0, True),
+        (np.full_like(scan, np.nan), 0.0, 1.0, False),
+        (torn, 0.0, 1.0, False),
+        (-scan, 0.0, 1.0, False),
+        # A beam without a return; no pixel is infinitely bright.
+        (np.full_like(scan, np.inf), 0.0, 1.0, sensor.measures_distance),
+        (np.zeros_like(scan), 0.0, 1.0, True),
+        *((scan, bearing, 1.0, False) for bearing in (np.radians(121.0), -np.pi, np.nan)),
+        *((scan, 0.0, distance, False) for distance in (0.0, -1.0, np.inf, np.nan)),
+    ]
+    for readings, bearing, distance, is_there in cases:
+        program = programs[f"detect_{sensor.name}"]
+        found = program(readings=readings, bearing=bearing, distance=distance)
+        assert found["is_there"] == is_there
+        assert np.isfinite(found["features"]).all()
+        if not is_there:
+            np.testing.assert_allclose(found["features"], 0.5)
+
+
+def test_decisions_are_those_of_the_policy_and_the_rules(models, loaded):
+    network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
+    classes = models.fusion.classes
+    assert CONFIG.mission.auctions
+
+    apply = jax.jit(lambda params, belief: network.apply(params, observation(belief)))
+    seconds = jax.jit(lambda pose, place: team_mdp.travel_seconds(CONFIG.team.travel, pose, place))
+    means, stds = np.asarray(classes.mean), np.asarray(classes.std)
+
+    def values_of(mean, std, present, m):
+        # A mean over all classes that a PoI which is not present may have.
+        is_there = present[:, None]
+        of_each = [
+            apply(
+                models.q_networks[m],
+                Belief(np.where(is_there, mean, means[c]), np.where(is_there, std, stds[c])),
+            )
+            for c in range(len(means))
+        ]
+        return np.where(np.append(present, True), np.mean(of_each, axis=0), -np.inf)
+
+    def decide(mean, std, looked_from, robot, positions, present, poses, modality, works, target):
+        values = values_of(mean, std, present, modality[robot])
+        bids = {}
+        for r, poi in np.ndindex(SIZES["robots"], SIZES["pois"]):
+            only = present & (np.arange(SIZES["pois"]) == poi)
+            alone = values_of(mean, std, only, modality[r])
+            apart = np.linalg.norm(poses[r, :2] - looked_from[poi, modality[r]], axis=-1)
+            way = models.novelty.to_go(apart, modality[r]) / CONFIG.team.travel.speed
+            there = seconds(poses[r], positions[poi][None])
+            if only.any() and alone[poi] > alone[-1]:
+                bids[r, poi] = float(there[0] + way)
+        of_robot = {poi: time for (r, poi), time in bids.items() if r == robot}
+        bids, won = {(r, n): x for (r, n), x in bids.items() if works[r]}, {}
+        while bids:
+            r, n = min(bids, key=bids.get)
+            won[r] = n
+            bids = {(i, j): x for (i, j), x in bids.items() if i != r and j != n}
+        taken = [target[r] for r in range(SIZES["robots"]) if works[r] and r != robot]
+        cost = {n: time + 100 * (n in taken) for n, time in of_robot.items()}
+        nearest = min(cost, key=cost.get) if cost else SIZES["pois"]
+        return won.get(int(robot), nearest), values
+
+    rows = check(loaded, "decide", decide, "action", "values")
+    assert len({int(row["action"]) for row in rows}) > 1
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("camera", [0]), ("lidar", [1]), ("camera+lidar", [0, 1])]
+)
+def test_encoders_give_what_jaxsense_gives(models, loaded, name, given):
+    @jax.jit
+    def encode(*features):
+        of_each = [None, None]
+        for m, x in zip(given, features, strict=True):
+            of_each[m] = x
+        mean, log_var = jmvae.encode(models.jmvae, make_jmvae(CONFIG), tuple(of_each))
+        return mean, jnp.exp(log_var / 2)
+
+    check(loaded, f"encode_{name}", encode, "mean", "std")
+
+
+def test_the_map_is_read_as_jaxsense_reads_it(models, loaded):
+    means = models.fusion.classes.mean
+
+    @jax.jit
+    @jax.vmap
+    def classify(mean, std):
+        belief, fusion = Belief(mean, std), models.fusion
+        plausible = latent.plausible_classes(belief, means)
+        return fusion.class_probabilities(belief), fusion.most_likely_class(belief), plausible
+
+    check(loaded, "classify", classify, "probabilities", "most_likely", "plausible")
+
+
+def test_contents_describe_what_is_there(models, file, loaded):
+    contents, programs = loaded
+    with zipfile.ZipFile(file) as files:
+        graphs = {x: onnx.load_model_from_string(files.read(f"{x}.onnx")).graph for x in programs}
+        # Data alone.
+        assert {f"{name}.onnx" for name in programs} | {"contents.json"} == {*files.namelist()}
+    for name, about in contents["programs"].items():
+        for ends, key in ((graphs[name].input, "inputs"), (graphs[name].output, "outputs")):
+            shapes = {
+                each.name: [n.dim_param or n.dim_value for n in each.type.tensor_type.shape.dim]
+                for each in ends
+            }
+            assert shapes == {n: x["shape"] for n, x in about[key].items()}
+            assert all(x["about"] for x in about[key].values())
+    # Three PoIs, two latent dimensions.
+    weights = {each.name: tuple(each.dims) for each in graphs["decide"].initializer}
+    assert weights["q_networks/0/params/Dense_0/kernel"][0] == 12
+    assert contents["labels"] == {"camera": ["red", "green"], "lidar": ["cylinder", "cube"]}
+    assert contents["classes"] == list(CONFIG.arena.classes)
+    for sensor in sensors.make(CONFIG):
+        angles = contents["sensors"][sensor.name]["angles"]
+        np.testing.assert_allclose(angles, sensor.angles, atol=1e-6)
+        assert contents["sensors"][sensor.name]["height"] == sensor.height
+    limits = contents["viewpoint"]
+    assert (limits["min_distance"], limits["max_distance"]) == (0.3, 1.2)
+    assert limits["max_bearing"] == pytest.approx(np.radians(20), abs=1e-6)
+    assert contents["versions"] == {"jaxsense": __version__}
+    for variance in (20.0, 5.0):
+        mdp = dataclasses.replace(CONFIG.mdp, unseen_variance=variance)
+        config = dataclasses.replace(CONFIG, mdp=mdp)
+        unseen = export._description(config, jaxsense.init(jax.random.key(0), config))["unseen"]
+        assert unseen == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
+        json.dumps(unseen)
+
+
+@pytest.mark.slow
+def test_a_robot_searches_its_scans_as_missions_do(models):
+    errors = SearchConfig(position=0.06, heading=3.0)
+    mission = dataclasses.replace(CONFIG.mission, localisation=LocalisationConfig(search=errors))
+    found = export.functions(dataclasses.replace(CONFIG, mission=mission))
+    # Untrained detectors have no scale, and are never unsure.
+    sure = jnp.float32(1.0)
+    unsure = [
+        dataclasses.replace(x, scale=sure, gate=dataclasses.replace(x.gate, scale=sure))
+        for x in models.detectors
+    ]
+    models = dataclasses.replace(models, detectors=tuple(unsure))
+    sensor, (detect, _) = sensors.make(CONFIG)[1], found["detect_lidar"]
+    scan = np.random.default_rng(0).uniform(0.1, 1.0, sensor.shape).astype(np.float32)
+    look = scan, np.float32(0.1), np.float32(0.7)
+    searched, plain = (
+        models.detect(1, sensor, *look, *search).features for search in ((errors,), ())
+    )
+    np.testing.assert_allclose(detect(models, *look)["features"], searched, atol=1e-6)
+    assert np.abs(searched - plain).max() > 1e-4
+
+
+def of_one(preset, name):
+    """Settings of a preset with one modality."""
+    config = PRESETS[preset]
+    one = dataclasses.replace(config.jmvae, reconstruction_weights=(10.0,))
+    return dataclasses.replace(config, modalities=(name,), jmvae=one)
+
+
+CASES = {name: PRESETS[name] for name in PRESETS} | {
+    f"{preset}, {name} alone": of_one(preset, name)
+    for preset in ("smoke", "noisy")
+    for name in ("camera", "lidar")
+}
+FAST = "smoke, camera alone", "smoke, lidar alone"  # others compile for many seconds
+
+
+def models_of(config):
+    """Models that were not trained, none of whose numbers is 0."""
+    rng = np.random.default_rng(0)
+
+    def moved(x):
+        is_real = isinstance(x, jax.Array) and x.dtype == np.float32
+        return x + np.float32(rng.uniform(0.05, 0.5, x.shape)) if is_real else x
+
+    return jax.tree.map(moved, jaxsense.init(jax.random.key(0), config))
+
+
+@pytest.mark.parametrize(
+    "case", [pytest.param(x, marks=[] if x in FAST else pytest.mark.slow) for x in CASES]
+)
+def test_an_archive_answers_as_ours_does(case):
+    config = CASES[case]
+    known = jaxsense.load_pretrained(case) if case in PRETRAINED else (config, models_of(config))
+    config, models = known
+    archive = export.archive(config, models)
+    contents, programs = robot.load(io.BytesIO(archive))
+    # Not every runtime reduces empty arrays; lists of axes, int64, may be empty.
+    with zipfile.ZipFile(io.BytesIO(archive)) as files:
+        graphs = [onnx.load_from_string(files.read(f"{name}.onnx")).graph for name in programs]
+    constants = [each for graph in graphs for each in graph.initializer]
+    assert all(0 not in x.dims for x in constants if x.data_type != onnx.TensorProto.INT64)
+    ours, rng = export.functions(config), np.random.default_rng(0)
+    assert {*programs} == {*ours} == {*contents["programs"]}
+    sizes = {"pois": 4, "looks": 5, "robots": len(contents["robots"])}
+    for name, (function, _) in ours.items():
+        apply = jax.jit(function)
+        for _ in range(3):
+            given = drawn(rng, contents, name, sizes)
+            found, expected = programs[name](**given), apply(models, *given.values())
+            for key, value in jax.tree.map(np.asarray, expected).items():
+                assert not np.isnan(value).any()
+                scale = np.abs(value[np.isfinite(value)]).max(initial=1.0)
+                np.testing.assert_allclose(found[key], value, 0, 1e-4 * scale, err_msg=name)
