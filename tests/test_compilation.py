@@ -60,8 +60,9 @@ def test_nothing_is_traced_any_more_when_a_run_is_over():
 
 
 def test_what_is_released_is_not_compiled_any_more(monkeypatch):
-    program, queued = Program(Compiler(Monitor()), "stage", "run"), []
-    monkeypatch.setattr(Compiler, "submit", lambda self, work: queued.append(work))
+    compiler, queued = Compiler(Monitor()), []
+    program = Program(compiler, "stage", "run")
+    monkeypatch.setattr(compiler.threads, "submit", queued.append)
     program.compile(lambda x: x, jnp.float32(0))
     program.release()
     monkeypatch.setattr(

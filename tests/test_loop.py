@@ -1,12 +1,12 @@
 """The loop that drives the stages of a training from the host."""
 
-import dataclasses
 import gc
 import signal
 import subprocess
 import sys
 import time
 import weakref
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,8 @@ from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.programs import Programs
+from jaxsense.training import stages
 from jaxsense.training.stage import Progress, Stage
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
@@ -33,12 +35,24 @@ def collect():
 
 
 @pytest.fixture
-def toy(monkeypatch, tmp_path):
-    """Trains toy stages: their programs are compiled as those of a run, without missions."""
-    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
+def replace_training(monkeypatch):
+    """Replaces the training of a run by some calls of `drive`, without missions."""
+    monkeypatch.setattr(Programs, "_compile_missions", lambda programs: None)
+    monkeypatch.setattr(programs, "make_world", lambda config: SimpleNamespace(arena=None))
 
-    def train(*stages, saved=False):
-        monkeypatch.setattr(programs, "stages", lambda config: list(stages))
+    def replace(toy_training):
+        train = lambda drive, config, arena: toy_training(drive)  # noqa: E731
+        monkeypatch.setattr(stages, "train", train)
+
+    return replace
+
+
+@pytest.fixture
+def toy(replace_training, tmp_path):
+    """Trains toy stages: their programs are compiled as those of a run."""
+
+    def train(toy_training, saved=False):
+        replace_training(toy_training)
         heard, warned = [], []
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         checkpoints = Checkpoints(tmp_path if saved else None, warned.append)
@@ -61,11 +75,16 @@ def counting(name, bad_from=jnp.inf, **settings):
         metrics = {"double": jnp.where(steps == 2, jnp.nan, 2 * steps)}
         return state + 2, Progress(loss, metrics)
 
-    return Stage(name, begin, advance=advance, steps=5, chunks=3, **settings)
+    return Stage(name, begin, advance, steps=5, chunks=3, **settings)
+
+
+def count(drive):
+    """The smallest training."""
+    drive(counting("count"))
 
 
 def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
-    found, heard, _ = toy(counting("count"))
+    found, heard, _ = toy(count)
     np.testing.assert_array_equal(found.outputs["count"], [6, 6])
     assert [report[:3] for report in heard] == [("count", n, 5) for n in (2, 4, 5)]
     # Steps 1 and 2, of which the second has no metric; 3 and 4; 5 alone.
@@ -85,7 +104,7 @@ def test_the_output_of_a_training_is_computed_once(toy, monkeypatch):
         return call(self, *args)
 
     monkeypatch.setattr(Program, "__call__", counted)
-    toy(counting("count"))
+    toy(count)
     assert calls == ["begin", *["advance"] * 3, "finish"]
 
 
@@ -94,34 +113,32 @@ def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
         raise ArithmeticError("no such policy")
 
     with pytest.raises(ArithmeticError, match="no such policy"):
-        toy(counting("count"), Stage("broken", broken, {"x": "count"}))
+        toy(lambda drive: drive(Stage("broken", broken), x=drive(counting("count"))))
 
 
 def test_stages_are_given_what_those_before_return(toy):
-    double = Stage("double", lambda key, config, x: 2 * x, {"x": "count"})
-    survey = Stage("survey", lambda key, config, x: {"y": x + 1}, {"x": "double"})
-    both = Stage(
-        "both",
-        lambda key, config, xs, n: n * xs[0] + xs[1]["y"],
-        {"xs": ("double", "survey"), "n": 3},
-    )
-    found, _, _ = toy(counting("count"), double, survey, both)
-    np.testing.assert_array_equal(found.outputs["survey"]["y"], [13, 13])
+    def train(drive):
+        double = drive(Stage("double", lambda key, config, x: 2 * x), x=drive(counting("count")))
+        more = drive(Stage("more", lambda key, config, x: {"y": x + 1}), x=double)
+        both = Stage("both", lambda key, config, xs, n: n * xs[0] + xs[1]["y"])
+        drive(both, xs=(double, more), n=jnp.int32(3))
+
+    found, _, _ = toy(train)
+    np.testing.assert_array_equal(found.outputs["more"]["y"], [13, 13])
     # 3 * 12 + 13
     np.testing.assert_array_equal(found.outputs["both"], [49, 49])
 
 
 def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect, monkeypatch):
-    double = lambda key, config, x: 2 * x  # noqa: E731
-    stages = [
-        Stage("first", lambda key, config: jnp.ones(3), is_passing=True),
-        Stage("second", double, {"x": "first"}),
-        Stage("third", double, {"x": "second"}),
-        Stage("fourth", double, {"x": "third"}),
-    ]
+    def train(drive):
+        x = drive(Stage("scenes", lambda key, config: jnp.ones(3)))
+        for name in ("second", "third", "fourth"):
+            x = drive(Stage(name, lambda key, config, x: 2 * x), x=x)
+
     begun, alive, begin = {}, {}, loop._Loop._begin
 
     def watched(self, stage, inputs):
+        time.sleep(0.5)  # it is noticed from time to time that a stage is done
         collect()
         alive[stage.name] = [name for name, output in begun.items() if output() is not None]
         output = begin(self, stage, inputs)
@@ -129,19 +146,18 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect
         return output
 
     monkeypatch.setattr(loop._Loop, "_begin", watched)
-    found, _, _ = toy(*stages)
-    assert alive["second"] == ["first"]
+    found, _, _ = toy(train)
+    assert alive["second"] == ["scenes"]
     assert alive["fourth"] == ["second", "third"]
     assert [*found.outputs] == ["second", "third", "fourth"]
     np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
 
 
-def test_programs_are_let_go_of_once_no_training_needs_them(collect, monkeypatch):
+def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_training):
     # Stages of one kind share their programs.
     names = "dqn_camera", "dqn_lidar"
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
-    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
-    monkeypatch.setattr(programs, "stages", lambda config: kinds)
+    replace_training(lambda drive: [drive(stage) for stage in kinds])
     monitor = Monitor()
     with pipeline.compiled(SMOKE, monitor, trainings=2) as compiled:
         shared = compiled.of(kinds[0])
@@ -157,9 +173,8 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, monkeypatch
             shared.advance.wait()
 
 
-def test_programs_are_held_where_the_number_of_trainings_is_unknown(monkeypatch):
-    monkeypatch.setattr(programs, "_trace_missions", lambda programs, compiler: None)
-    monkeypatch.setattr(programs, "stages", lambda config: [counting("count")])
+def test_programs_are_held_where_the_number_of_trainings_is_unknown(replace_training):
+    replace_training(count)
     monitor = Monitor()
     with pipeline.compiled(SMOKE, monitor) as compiled:
         loop.train(KEY, SMOKE, compiled, monitor)
@@ -184,7 +199,7 @@ def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(
 
     monkeypatch.setattr(loop._Loop, "_begin", watched)
     monkeypatch.setattr(loop._Loop, "_report", reported)
-    toy(counting("count"))
+    toy(count)
     # It is saved if the first chunk fails.
     assert alive == [True, False, False]
 
@@ -198,9 +213,10 @@ def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
         return part(args, i, *rest)
 
     monkeypatch.setattr(devices, "part", counted)
+    monkeypatch.setattr(loop, "_ONLY_PASSED_ON", ())
     first = Stage("first", lambda key, config: jnp.arange(2.0 * number).reshape(number, 2))
-    survey = Stage("survey", lambda key, config, x: (x + 1, x.sum(axis=1)), {"x": "first"})
-    found, _, _ = toy(first, dataclasses.replace(survey, has_rows=True))
+    survey = Stage("survey", lambda key, config, x: (x + 1, x.sum(axis=1)))
+    found, _, _ = toy(lambda drive: drive(survey, x=drive(first)))
     x = np.arange(2.0 * number).reshape(number, 2)
     np.testing.assert_array_equal(found.outputs["survey"][0], x + 1)
     np.testing.assert_array_equal(found.outputs["survey"][1], x.sum(axis=1))
@@ -208,9 +224,9 @@ def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
 
 
 def test_what_was_saved_is_not_trained_again(toy):
-    first, heard, _ = toy(counting("count"), saved=True)
+    first, heard, _ = toy(count, saved=True)
     assert heard
-    again, heard, _ = toy(counting("count"), saved=True)
+    again, heard, _ = toy(count, saved=True)
     assert not heard
     np.testing.assert_array_equal(first.outputs["count"], again.outputs["count"])
     np.testing.assert_array_equal(first.curves["count"]["double"], again.curves["count"]["double"])
@@ -222,7 +238,7 @@ def test_what_cannot_be_saved_ends_the_run_with_its_error(toy, monkeypatch):
 
     monkeypatch.setattr(Checkpoints, "save", full)
     with pytest.raises(OSError, match="No space left on device"):
-        toy(counting("count"), saved=True)
+        toy(count, saved=True)
 
 
 @pytest.mark.parametrize("bad", [(), (0,), (1,)])
@@ -234,9 +250,9 @@ def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad)
         counting(f"trial_{i}", 4 if i in bad else jnp.inf, is_optional=True, finish=finish)
         for i in range(2)
     ]
-    inputs = {"x": ("trial_0", "trial_1")}
-    best = Stage("best", lambda key, config, x: jnp.nanmin(jnp.stack(x)), inputs)
-    found, _, warned = toy(*trials, best, saved=True)
+    best = Stage("best", lambda key, config, x: jnp.nanmin(jnp.stack(x)))
+    train = lambda drive: drive(best, x=tuple(map(drive, trials)))  # noqa: E731
+    found, _, warned = toy(train, saved=True)
     assert warned == [f"trial_{i}: loss = nan at step 4 of 5: left out" for i in bad]
     assert found.outputs["best"] == 6
     assert [bool(np.isnan(found.outputs[f"trial_{i}"])) for i in range(2)] == [
@@ -247,13 +263,16 @@ def test_an_optional_training_that_is_not_finite_is_left_out_and_named(toy, bad)
 def test_a_training_ends_if_what_comes_of_optional_ones_is_not_finite(toy):
     trial = counting("trial", 4, is_optional=True)
     with pytest.raises(StageError, match="best: results are not finite"):
-        toy(trial, Stage("best", lambda key, config, x: x, {"x": "trial"}))
+        toy(lambda drive: drive(Stage("best", lambda key, config, x: x), x=drive(trial)))
 
 
 def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
-    follows = Stage("follows", lambda key, config, x: x, {"x": "count"})
+    def train(drive):
+        drive(Stage("follows", lambda key, config, x: x), x=drive(counting("count", 4)))
+        drive(counting("beside"))
+
     with pytest.raises(StageError, match="count: loss = nan at step 4 of 5"):
-        toy(counting("count", 4), follows, counting("beside"))
+        toy(train)
 
 
 def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
@@ -270,7 +289,7 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
 
     monkeypatch.setattr(loop._Loop, "_begin", fails_or_waits)
     with pytest.raises(OSError, match="No space left"):
-        toy(counting("count"), Stage("full", lambda key, config: jnp.zeros(2)))
+        toy(lambda drive: (count(drive), drive(Stage("full", lambda key, config: jnp.zeros(2)))))
 
 
 def chunked(name, chunks, **settings):

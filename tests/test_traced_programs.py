@@ -10,10 +10,9 @@ from smoke import SMOKE
 
 from jaxsense import train
 from jaxsense.config import PRESETS
-from jaxsense.run import programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
-from jaxsense.training.stages import stages
+from jaxsense.run.programs import Programs
 
 NUMBERS = {
     "detector.learning-rate": "0.001",
@@ -98,14 +97,11 @@ def lowered(config, names=None):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Program, "compile", compile_one)
         if names is not None:
-            patch.setattr(programs, "_trace_missions", lambda *_: None)
-            listed = stages(config)
-            some = [stage for stage in listed if stage.name in {*names, "survey", "detections"}]
-            patch.setattr(programs, "stages", lambda *_: some)
+            patch.setattr(Programs, "_compile_missions", lambda programs: None)
         with Compiler(Monitor()) as compiler:
-            made = programs.compile_programs(config, compiler)
-            for each in made.of_stages.values():
-                each.shapes.result()
+            made = Programs(config, compiler)
+            for stage in made.stages:
+                made.of(stage).shapes.result()
             if names is None:
                 made.player.result()
     return found

@@ -1,59 +1,41 @@
 """Compiles programs in the background."""
 
 import contextlib
-from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from types import TracebackType
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxsense.run import devices
-from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.devices import ALONE, Row, Workers
 from jaxsense.run.kept import Function, Kept, Traced, shapes_of, trace
 from jaxsense.run.monitor import Monitor
 
 
 class Compiler:
-    """Compiles the programs of a run in its own threads.
+    """Compiles the programs of a run in its own threads, until the end of the block.
 
     Attributes:
       monitor: measures compile times.
       kept: cache of traced programs, if any.
+      threads: compile.
+      is_closed: whether the run is over.
     """
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
-        self.monitor, self.kept = monitor, kept
-        self._threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
-        self._is_closed = False
+        self.monitor, self.kept, self.is_closed = monitor, kept, False
+        self.threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
 
     def __enter__(self) -> "Compiler":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Cancels pending work, which would keep the process alive."""
-        self._is_closed = True
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
-    def check_open(self) -> None:
-        """Checks that the run is not over.
-
-        Raises:
-          CancelledError: if it is.
-        """
-        if self._is_closed:
-            raise CancelledError
-
-    def submit(self, work: Callable[[], None]) -> None:
-        """Runs `work` in one of the threads."""
-        self._threads.submit(work)
+        self.is_closed = True
+        self.threads.shutdown(wait=False, cancel_futures=True)
 
 
 class Program:
@@ -74,6 +56,7 @@ class Program:
         self._stage, self._name = stage, name
         self._compiled: Future[Function] = Future()
         self._workers, self._whole, self._results = ALONE, (), None
+        self._rows: int | None = None  # of results, where the last are left out
 
     def compile(
         self,
@@ -88,7 +71,7 @@ class Program:
         Args:
           function: what to compile.
           *args: arguments or their shapes, for example the result of another program's `compile`.
-          workers: share the rows of the arguments; their parts must divide the rows.
+          workers: share the rows of the arguments.
           whole: positions of arguments that every worker gets undivided.
           **options: see `devices.compiler_options`.
 
@@ -98,10 +81,11 @@ class Program:
         Raises:
           CancelledError: if the run is over.
         """
-        self._compiler.check_open()
+        if self._compiler.is_closed:
+            raise CancelledError
         self._workers, self._whole = workers, whole
         with self._measure("compile_s"):
-            lowered, results = self._lower(function, args)
+            lowered, results = self._lower(function, self._padded(args))
         self._results = devices.of_all_parts(results, workers.shares)
 
         def compile_lowered() -> None:
@@ -118,14 +102,35 @@ class Program:
                 self._compiled.set_result(compiled)
             devices.give_back_freed()
 
-        self._compiler.submit(compile_lowered)
-        return self._results
+        self._compiler.threads.submit(compile_lowered)
+        if (rows := self._rows) is None:
+            return self._results
+        return jax.tree.map(lambda x: x.update(shape=(rows, *x.shape[1:])), self._results)
 
     def _measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
         """Adds the seconds of a block to those of the stage."""
         return self._monitor.stopwatch.measure(kind, self._stage)
 
-    def _lower(self, function: Function, args: PyTree) -> tuple[jax.stages.Lowered, PyTree]:
+    def _padded(self, args: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
+        """Arguments of which all workers get equally many rows, the first of them repeated."""
+        number = self._workers.shares
+        if number == 1:
+            return args
+
+        def pad(x: Row) -> Row:
+            given = x.shape[0]
+            if not (missing := -given % number):
+                return x
+            self._rows = given
+            if isinstance(x, jax.ShapeDtypeStruct):
+                return x.update(shape=(given + missing, *x.shape[1:]))
+            return x[jnp.arange(given + missing) % given]
+
+        return tuple(x if i in self._whole else jax.tree.map(pad, x) for i, x in enumerate(args))
+
+    def _lower(
+        self, function: Function, args: tuple[PyTree, ...]
+    ) -> tuple[jax.stages.Lowered, PyTree]:
         """A function ready to be compiled, and the shapes of a share's results; see `compile`."""
         workers, whole = self._workers, self._whole
         call, share = (
@@ -142,8 +147,7 @@ class Program:
     def _found_or_traced(self, function: Function, share: tuple[PyTree, ...]) -> Traced | None:
         """The program apart from what calls it, which only caches and meshes need."""
         if (kept := self._compiler.kept) is not None:
-            name = f"{self._stage}-{self._name}"
-            found = kept.find_or_trace(name, function, share)
+            found = kept.find_or_trace(f"{self._stage}-{self._name}", function, share)
             if found is not None:
                 return found
         if self._workers.mesh is None:
@@ -181,9 +185,6 @@ class Program:
     def wait(self) -> Function:
         """Blocks until the program is compiled.
 
-        Returns:
-          The compiled program.
-
         Raises:
           Stopped: if the run must stop.
           StageError: if a concurrent stage failed.
@@ -208,7 +209,8 @@ class Program:
             return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
         with self._measure("run_s"):
-            args = self._put(args)
+            args = self._put(self._padded(args))
             output = devices.joined(run, number, self._workers.threads, self._results)
             # Other programs run on one device.
-            return output if self._workers.mesh is None else devices.fetched(output)
+            output = output if self._workers.mesh is None else devices.fetched(output)
+            return output if self._rows is None else jax.tree.map(lambda x: x[: self._rows], output)

@@ -7,16 +7,21 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.run import devices
 from jaxsense.run.checkpoints import Checkpoints, Curves, Unfinished
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Programs, padded, workers_for
+from jaxsense.run.programs import Programs
+from jaxsense.training import stages
 from jaxsense.training.stage import Output, Progress, Stage
 
 _SAVE_PERIOD = 60.0  # s
+_MAX_THREADS = 64  # stages that run or wait at once
+_ONLY_PASSED_ON = ("scenes", "survey", "examples", "views")  # let go of once no stage needs them
+_SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # beside trainings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,57 +87,49 @@ class _Loop:
         self._checkpoints, self._saver = checkpoints, saver
         self._saving: list[Future[None]] = []
         self._curves: dict[str, Curves] = {}
-        self._outputs, self._done = dict[str, Output](), set[str]()
 
     def run(self) -> Trained:
         """Runs all stages."""
-        stages, done = self._programs.stages, dict[str, Future[None]]()
-        with ThreadPoolExecutor(len(stages), "stage") as threads:
-            for stage in stages:
-                before = {name: done[name] for name in stage.sources}
-                done[stage.name] = threads.submit(self._run_stage, stage, before)
-            # A wait without timeout may not notice Ctrl-C.
-            while wait(done.values(), timeout=0.2).not_done:
-                pass
-        for future in done.values():
-            future.result()
+        begun: dict[str, Future[Output]] = {}
+        with ThreadPoolExecutor(_MAX_THREADS, "stage") as threads:
+
+            def drive(stage: Stage, **inputs: Output) -> Future[Output]:
+                begun[stage.name] = threads.submit(self._run_stage, stage, inputs)
+                return begun[stage.name]
+
+            stages.train(drive, self._config, self._programs.arena)
+            kept = {name: x for name, x in begun.items() if name not in _ONLY_PASSED_ON}
+            left = set(begun.values())
+            begun.clear()
+            while left:
+                # A wait without timeout may not notice Ctrl-C.
+                done, left = wait(left, timeout=0.2)
+                if done:
+                    done.clear()  # lets go of outputs
+                    devices.give_back_freed()
         self._monitor.check_stop()
+        outputs = {name: output.result() for name, output in kept.items()}
         self.wait_for_saving()
-        return Trained(self._outputs, self._curves)
+        return Trained(outputs, self._curves)
 
     def wait_for_saving(self) -> None:
         """Waits until all is saved, and raises the first error."""
         for each in self._saving:
             each.result()
 
-    def _run_stage(self, stage: Stage, before: dict[str, Future[None]]) -> None:
-        """Finds the output of a stage, and lets go of outputs that no other stage needs."""
-        try:
-            self._outputs[stage.name] = self._output(stage, before)
-        finally:
-            self._done.add(stage.name)
-            left = [each for each in self._programs.stages if each.name not in self._done]
-            needed = {name for each in left for name in each.sources}
-            for each in self._programs.stages:
-                if each.is_passing and each.name not in needed:
-                    self._outputs.pop(each.name, None)
-            self._programs.used(stage)
-            devices.give_back_freed()
-
-    def _output(self, stage: Stage, before: dict[str, Future[None]]) -> Output:
+    def _run_stage(self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]]) -> Output:
         """The output of a stage, loaded if it was saved."""
         try:
-            found = self._load(stage) if stage.is_saved else None
+            is_saved = bool(stage.chunks) or stage.name in _SAVED
+            found = self._load(stage) if is_saved else None
             if found is not None:
                 return found
-            for future in before.values():
-                future.result()
-            inputs = stage.select({name: self._outputs[name] for name in before})
+            given = jax.tree.map(lambda x: x.result() if isinstance(x, Future) else x, inputs)
             self._monitor.check_stop()
-            output = (self._train if stage.chunks else self._begin)(stage, inputs)
+            output = (self._train if stage.chunks else self._once)(stage, given)
             if not stage.is_optional:
                 self._monitor.check_finite(stage.name, "results", output)
-            if stage.is_saved:
+            if is_saved:
                 self._save(stage, output)
             return output
         except Stopped:
@@ -140,19 +137,18 @@ class _Loop:
         except Exception as error:
             self._monitor.fail(error)
             raise
+        finally:
+            self._programs.used(stage)
+
+    def _once(self, stage: Stage, inputs: dict[str, Output]) -> Output:
+        """The output of a stage without steps."""
+        output = stage.finish(self._config, self._begin(stage, inputs), **inputs)
+        # Joined rows lie on the host, and every program would transfer them again.
+        return jax.device_put(output)
 
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
-        """The first state, or the output of a stage without steps."""
-        key = stage.key(self._key)
-        program, config = self._programs.of(stage).begin, self._config
-        if not stage.has_rows:
-            return stage.divide(config, program(key, config, inputs))
-        number = len(jax.tree.leaves(inputs)[0])
-        workers = workers_for(number, self._programs.workers)
-        found = program(key, config, padded(inputs, workers))
-        output = stage.divide(config, jax.tree.map(lambda x: x[:number], found))
-        # Joined parts lie on the host, and every program would transfer them again.
-        return jax.device_put(output)
+        """The first state."""
+        return self._programs.of(stage).begin(stage.key(self._key), self._config, inputs)
 
     def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage with steps."""

@@ -19,7 +19,7 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import OwnPolicies, Programs, compile_programs
+from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.summary import compare
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
@@ -83,7 +83,7 @@ def compiled(
       monitor: receives the time that it takes.
       workers: share scenes and missions.
       kept: where to keep compiled programs for later runs, if anywhere.
-      trainings: see `compile_programs`.
+      trainings: see `Programs`.
       policies: custom policies by name; keep no programs with these, whose code may change.
 
     Raises:
@@ -91,7 +91,7 @@ def compiled(
     """
     mission.require_playable(config, policies)
     with Compiler(monitor, kept) as compiler:
-        yield compile_programs(config, compiler, workers, trainings, policies)
+        yield Programs(config, compiler, workers, trainings, policies)
 
 
 def learn(

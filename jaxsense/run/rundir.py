@@ -26,7 +26,7 @@ from jaxsense.summary.compare import UNKNOWN
 from jaxsense.summary.read import ORIGINS, read_made
 from jaxsense.tasks.pretrained import PREFIX, PRETRAINED, load_pretrained
 from jaxsense.training import stages
-from jaxsense.training.agents import learner, tour_stages
+from jaxsense.training.agents import learner
 
 _METRICS = "metrics.jsonl"
 _MOST_METRICS, _MOST_METRICS_LINE = 2**28, 2**16  # bytes
@@ -345,7 +345,6 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
     q_networks = zip(config.modalities, models.q_networks, strict=True)
-    orders = zip(tour_stages(config), models.tours, strict=True)
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
         "best_jmvae": models.jmvae,
@@ -353,5 +352,5 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
         "fusion": models.fusion,
         "look_values": models.look_values,
         **{learner(config, name): q_network for name, q_network in q_networks},
-        **{stage.name: params for stage, params in orders},
+        **dict(zip(("tours",), models.tours, strict=False)),
     }

@@ -18,7 +18,7 @@ from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin
 from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, fixed_draws, key_of_seed
-from jaxsense.training.mdp import models_of
+from jaxsense.training.comparison import models_of
 
 TASKS = {
     "map-v0": "the paper's map of three PoIs, with detections that are almost always confident",

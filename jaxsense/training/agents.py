@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import cast
 
 import jax
@@ -18,7 +17,7 @@ from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import map_mdp, optimum, rewards, rules, team_mdp, tours
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.environments import Environment
-from jaxsense.dqn.map_mdp import Looks, MapMdp, MapState
+from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import expected_gain
 from jaxsense.dqn.pooling import PoolingNetwork
@@ -29,9 +28,9 @@ from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
+from jaxsense.training.comparison import held_out_mdp, mdp_of
 from jaxsense.training.detections import Detections, Starts
-from jaxsense.training.mdp import held_out_mdp, mdp_of
-from jaxsense.training.stage import Output, Progress, Stage, chunk_size, num_chunks
+from jaxsense.training.stage import Drive, Output, Progress, Stage, in_chunks
 from jaxsense.vae import readout
 from jaxsense.vae.detectors import Detector
 
@@ -90,98 +89,119 @@ def look_values(
     return tuple(map(of_modality, range(len(config.modalities))))
 
 
-def agent_stages(arena: Arena, config: Config) -> list[Stage]:
-    """Makes the stages that draw first states of episodes and train each learner's Q-network.
+def train(
+    drive: Drive,
+    config: Config,
+    arena: Arena,
+    *,
+    look_values: Output,
+    detections: Output,
+    fusion: Output,
+    detectors: tuple[Output, ...],
+) -> dict[str, Output]:
+    """Trains each learner's Q-network, and the network that orders looks, if any does.
 
     Args:
-      arena: of live looks.
+      drive: executes stages.
       config: all settings.
+      arena: of live looks.
+      look_values: values of looks with each modality.
+      detections: of all sensors.
+      fusion: how looks update the map.
+      detectors: of each modality.
+
+    Returns:
+      The Q-networks by `learner`.
     """
-
-    def environment(
-        config: Config,
-        modality: Int[Array, ""],
-        detections: Detections,
-        fusion: Fusion,
-        detectors: tuple[Detector, ...],
-    ) -> Environment[Output]:
-        looks: dict[str, Callable[[], Looks]] = {
-            "live": lambda: Live(make_world(config, arena=arena), detectors),
-            "bank": lambda: Bank(detections.bank),
-        }
-        mdp = mdp_of(config, fusion, looks[config.dqn.observe]())
-        return make_agent(config).environment(mdp, modality)
-
-    def starts(key: Key, config: Config, *, detections: Detections, **inputs: Output) -> Output:
-        """First states of episodes, `[num_starts]`."""
-        learning = environment(config, jnp.int32(0), detections, **inputs)
-        if not detections.starts.classes.shape[0]:
-            return dqn.starts(key, learning, config.dqn)
-        return _surveyed_starts(key, learning.mdp.map, detections.starts, config.dqn.num_starts)
-
-    def begin(
-        key: Key, config: Config, *, modality: Int[Array, ""], starts: Output, **inputs: Output
-    ) -> State:
-        return dqn.init(key, environment(config, modality, **inputs), config.dqn, starts)
-
-    def advance(
-        key: Key,
-        config: Config,
-        state: State,
-        *,
-        modality: Int[Array, ""],
-        starts: Output,
-        detections: Detections,
-        fusion: Fusion,
-        detectors: tuple[Detector, ...],
-    ) -> tuple[State, Progress]:
-        mdp = held_out_mdp(config, fusion, detections)
-
-        def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-            return comparison.learned_return(key, modality, q_network, mdp, config)
-
-        learning = environment(config, modality, detections, fusion, detectors)
-        state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluate)
-        reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
-        loss = jnp.where(info.is_finite, info.loss, jnp.nan)
-        metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}
-        return state, Progress(loss, metrics)
-
-    def finish(config: Config, state: State, **_: Output) -> Params:
-        del config
-        return state.params
-
-    names = tuple(f"detector_{name}" for name in config.modalities)
-    learned = {"detections": "detections", "fusion": "fusion", "detectors": names}
-    learners: dict[str, int] = {}
+    given = {"detections": detections, "fusion": fusion, "detectors": detectors}
+    starts = drive(Stage("starts", functools.partial(_starts, arena)), **given)
+    networks: dict[str, Output] = {}
     for m, name in enumerate(config.modalities):
         # A team's one network is evaluated with the first sensor.
-        learners.setdefault(learner(config, name), m)
-    return [
-        Stage("starts", starts, learned),
-        *(
-            Stage(
-                name,
-                begin,
-                {"modality": m, "starts": "starts", **learned},
-                advance,
-                finish,
+        if (network := learner(config, name)) not in networks:
+            stage = Stage(
+                network,
+                functools.partial(_begin, arena),
+                functools.partial(_advance, arena),
+                _params,
                 steps=config.dqn.epochs,
                 chunks=config.dqn.epochs // config.dqn.chunk,
                 shares="dqn",
             )
-            for name, m in learners.items()
-        ),
-    ]
+            networks[network] = drive(stage, modality=jnp.int32(m), starts=starts, **given)
+    for network in make_agent(config).tour_networks:
+        tour = _tour_stage(config, network)
+        drive(tour, look_values=look_values, fusion=fusion, detections=detections)
+    return networks
+
+
+def _environment(
+    arena: Arena,
+    config: Config,
+    modality: Int[Array, ""],
+    *,
+    detections: Detections,
+    fusion: Fusion,
+    detectors: tuple[Detector, ...],
+) -> Environment[Output]:
+    """What an agent learns in."""
+    is_live = config.dqn.observe == "live"
+    looks = Live(make_world(config, arena=arena), detectors) if is_live else Bank(detections.bank)
+    return make_agent(config).environment(mdp_of(config, fusion, looks), modality)
+
+
+def _starts(
+    arena: Arena, key: Key, config: Config, *, detections: Detections, **inputs: Output
+) -> Output:
+    """First states of episodes, `[num_starts]`."""
+    learning = _environment(arena, config, jnp.int32(0), detections=detections, **inputs)
+    if not detections.starts.classes.shape[0]:
+        return dqn.starts(key, learning, config.dqn)
+    return _surveyed_starts(key, learning.mdp.map, detections.starts, config.dqn.num_starts)
+
+
+def _begin(
+    arena: Arena,
+    key: Key,
+    config: Config,
+    *,
+    modality: Int[Array, ""],
+    starts: Output,
+    **inputs: Output,
+) -> State:
+    return dqn.init(key, _environment(arena, config, modality, **inputs), config.dqn, starts)
+
+
+def _advance(
+    arena: Arena,
+    key: Key,
+    config: Config,
+    state: State,
+    *,
+    modality: Int[Array, ""],
+    starts: Output,
+    **inputs: Output,
+) -> tuple[State, Progress]:
+    mdp = held_out_mdp(config, inputs["fusion"], inputs["detections"])
+
+    def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
+        return comparison.learned_return(key, modality, q_network, mdp, config)
+
+    learning = _environment(arena, config, modality, **inputs)
+    state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluate)
+    reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
+    loss = jnp.where(info.is_finite, info.loss, jnp.nan)
+    metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}
+    return state, Progress(loss, metrics)
+
+
+def _params(config: Config, state: State, **_: Output) -> Params:
+    del config
+    return state.params
 
 
 def learner(config: Config, modality: str) -> str:
-    """Name of the stage that trains the Q-network of a modality's robots.
-
-    Args:
-      config: all settings.
-      modality: name of the sensor.
-    """
+    """Name of the stage that trains the Q-network of a modality's robots."""
     return f"dqn_{make_agent(config).learner(modality)}"
 
 
@@ -196,18 +216,13 @@ def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapS
     return jax.vmap(begin)(jax.random.split(key, number), starts)
 
 
-def tour_stages(config: Config) -> list[Stage]:
-    """Makes the stage of the network that orders looks, if any does, see `tours`."""
-    return [_tour_stage(config, network) for network in make_agent(config).tour_networks]
-
-
 def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
     settings = config.team.tours
-    size, chunks = chunk_size(settings.steps), num_chunks(settings.steps)
+    size, chunks = in_chunks(settings.steps)
     number = -(-settings.states // chunks)  # of states in each chunk, in which choices are tried
 
     def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
-        fit = supervised.start(make_agent(config).init_tours(key)[0], config.team.tours)
+        fit = supervised.start(make_agent(config).init_tours(key)[0], settings)
         no_trials = tours.no_trials(network.features, config.team.num_pois[1], chunks * number)
         return fit, no_trials
 
@@ -236,8 +251,7 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
         del config
         return state[0].params
 
-    inputs = {"look_values": "look_values", "fusion": "fusion", "detections": "detections"}
-    return Stage("tours", begin, inputs, advance, finish, steps=settings.steps, chunks=chunks)
+    return Stage("tours", begin, advance, finish, settings.steps, chunks)
 
 
 @pytree

@@ -1,4 +1,4 @@
-"""Stages that compare policies in the map MDP."""
+"""The MDPs of a training, and stages that compare policies in them."""
 
 import dataclasses
 import functools
@@ -13,14 +13,16 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn import episodes, policies
-from jaxsense.dqn.map_mdp import MapMdp, random_start
+from jaxsense.dqn.map_mdp import Looks, MapMdp, random_start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Policy, Values
 from jaxsense.dqn.reference import reference
-from jaxsense.models import Models, make_agent, make_bayes
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.looks import Bank, make_mdp
+from jaxsense.models import Models, make_agent, make_bayes, make_models
 from jaxsense.training.detections import Detections
-from jaxsense.training.mdp import held_out_mdp, models_of
 from jaxsense.training.stage import Output
+from jaxsense.vae import novelty
 
 COMPARED = ("latent", "optimal", "greedy", "naive", "random")
 """Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`; `optimal` is the
@@ -32,6 +34,39 @@ the noise of looks; NaN where a value or a reward is NaN."""
 
 _STATE_BY_STATE = ("latent", "optimal")
 _LEAST_GROUP = 1152  # episodes: smaller groups cost more than they save
+
+
+def models_of(
+    config: Config,
+    fusion: Fusion,
+    look_values: tuple[LookValues, ...] = (),
+    q_networks: tuple[Params, ...] = (),
+) -> Models:
+    """Models trained so far; the others are empty."""
+    return make_models(
+        config,
+        detectors=(),
+        jmvae={},
+        fusion=fusion,
+        novelty=novelty.independent(len(config.modalities)),
+        look_values=look_values,
+        q_networks=q_networks,
+        tours=(),
+    )
+
+
+def mdp_of(config: Config, fusion: Fusion, looks: Looks) -> MapMdp | TeamMdp:
+    """MDP in which agents learn."""
+    return make_mdp(config, models_of(config, fusion), looks)
+
+
+def held_out_mdp(
+    config: Config, fusion: Fusion, detections: Detections, num_pois: int | None = None
+) -> MapMdp:
+    """Map MDP with held-out features, in which policies are measured."""
+    mdp = mdp_of(config, fusion, Bank(detections.held_out)).map
+    number = config.arena.num_pois if num_pois is None else num_pois
+    return dataclasses.replace(mdp, num_pois=number)
 
 
 def learned_return(

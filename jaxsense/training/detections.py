@@ -15,9 +15,8 @@ from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene
 from jaxsense.training import gating
-from jaxsense.training.fits import fit_stage
 from jaxsense.training.gating import Examples
-from jaxsense.training.stage import Stage
+from jaxsense.training.stage import Stage, fit_stage
 from jaxsense.training.surveys import Surveys, held_out_per_class, num_scenes, num_starts
 from jaxsense.vae import detectors
 from jaxsense.vae import gate as gates
@@ -56,15 +55,6 @@ class Detections:
     windows: tuple[Float[Array, "C 1 F"], ...]
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages that train a detector for each modality, and the stage `detections`."""
-    names = tuple(f"detector_{name}" for name in config.modalities)
-    return [
-        *(detector_stage(m, name, config) for m, name in enumerate(names)),
-        Stage("detections", detect, {"surveys": "survey", "trained": names}),
-    ]
-
-
 def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
     """What to train each detector and its gate on, besides the windows of the surveys.
 
@@ -91,14 +81,8 @@ def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examp
     return tuple(of_modality(keys[m], m, names[m], made[m]) for m in range(len(names)))
 
 
-def detector_stage(modality: int, name: str, config: Config) -> Stage:
-    """Makes the stage that trains the detector of one modality.
-
-    Args:
-      modality: index of the sensor.
-      name: of the stage.
-      config: all settings.
-    """
+def detector_stage(modality: int, config: Config) -> Stage:
+    """Makes the stage that trains the detector of one modality, by its index."""
 
     def untrained(
         key: Key, config: Config, *, surveys: Surveys, examples: tuple[Examples, ...]
@@ -139,10 +123,8 @@ def detector_stage(modality: int, name: str, config: Config) -> Stage:
         return detectors.calibrate(found, windows, labels) if len(labels) else found
 
     return fit_stage(
-        name,
-        {"surveys": "survey", "examples": "examples"},
-        config,
-        settings=lambda config: config.detector,
+        f"detector_{config.modalities[modality]}",
+        config.detector,
         untrained=untrained,
         problem=problem,
         trained=trained,

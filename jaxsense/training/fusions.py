@@ -1,7 +1,6 @@
-"""The stages that make the fusion: in place, or a filter that learns from histories of looks."""
+"""Stages that make the fusion: in place, or a filter that learns from histories of looks."""
 
 import dataclasses
-from collections.abc import Callable
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
@@ -9,20 +8,22 @@ from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior
 from jaxsense.training.detections import Detections
-from jaxsense.training.fits import fit_stage
-from jaxsense.training.stage import Output, Stage
+from jaxsense.training.stage import Drive, Output, Stage, fit_stage
 from jaxsense.vae import filter
 from jaxsense.vae.filter import Filter
 from jaxsense.vae.fusion import InPlace, train_decoders
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages of `config.jmvae.fusion`, the last of which is called `fusion`."""
-    kinds: dict[str, Callable[[Config], list[Stage]]] = {
-        "in_place": _in_place_stages,
-        "filter": _filter_stages,
-    }
-    return kinds[config.jmvae.fusion](config)
+def train(
+    drive: Drive, config: Config, *, params: Output, classes: Output, detections: Output
+) -> Output:
+    """The fusion of `config.jmvae.fusion`; see `fit_in_place` for its inputs."""
+    given = {"classes": classes, "detections": detections}
+    if config.jmvae.fusion == "in_place":
+        return drive(Stage("fusion", fit_in_place), params=params, **given)
+    # A stage of its own, whose name determines its key.
+    found = drive(_filter_stage(config), **given)
+    return drive(Stage("fusion", lambda key, config, fusion: fusion), fusion=found)
 
 
 def fit_in_place(
@@ -42,15 +43,8 @@ def fit_in_place(
     return make_in_place(config, train_decoders(key, params, model, bank, settings), classes)
 
 
-def _in_place_stages(config: Config) -> list[Stage]:
-    """The stage that makes the fusion in place."""
-    del config
-    given = {"params": "best_jmvae", "classes": "class_beliefs", "detections": "detections"}
-    return [Stage("fusion", fit_in_place, given, is_kept=True)]
-
-
-def _filter_stages(config: Config) -> list[Stage]:
-    """The training of the filter, and the stage that returns it as the fusion."""
+def _filter_stage(config: Config) -> Stage:
+    """The training of the filter."""
 
     def untrained(
         key: Key, config: Config, *, classes: Belief, detections: Detections
@@ -67,20 +61,4 @@ def _filter_stages(config: Config) -> list[Stage]:
     def trained(config: Config, fitted: Filter, fit: FitState, **_: Output) -> Filter:
         return dataclasses.replace(fitted, networks=fit.params)
 
-    training = fit_stage(
-        "filter",
-        {"classes": "class_beliefs", "detections": "detections"},
-        config,
-        settings=lambda config: config.filter,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-    )
-    # The key of a training depends on the name of its stage.
-    fusion = Stage("fusion", _filter, {"fusion": "filter"}, is_kept=True)
-    return [training, fusion]
-
-
-def _filter(key: Key, config: Config, *, fusion: Filter) -> Filter:
-    del key, config
-    return fusion
+    return fit_stage("filter", config.filter, untrained=untrained, problem=problem, trained=trained)

@@ -7,35 +7,28 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_jmvae, make_prior, make_readout
-from jaxsense.training import histories
+from jaxsense.training import histories, stage
 from jaxsense.training.detections import Detections
-from jaxsense.training.fits import jmvae_restarts
 from jaxsense.training.stage import Stage
 from jaxsense.vae import jmvae
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 
 
-def make_stages(config: Config) -> list[Stage]:
-    """Makes the stages from the restarts of the JMVAE to its class beliefs."""
+def restarts(config: Config) -> list[Stage]:
+    """Makes the stages that train the JMVAE from different random parameters."""
 
-    def problem(config: Config, *, detections: Detections) -> jmvae.Fitting:
+    def untrained(key: Key, config: Config, *, detections: Detections) -> tuple[tuple[()], Params]:
+        del detections
+        return (), jmvae.init(key, make_jmvae(config))
+
+    def problem(config: Config, _: tuple[()], *, detections: Detections) -> jmvae.Fitting:
         return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
 
-    def init(key: Key, config: Config) -> Params:
-        return jmvae.init(key, make_jmvae(config))
-
-    given = {"detections": "detections"}
-    restarts = jmvae_restarts(config, given, init=init, problem=problem)
-    names = tuple(stage.name for stage in restarts)
-    return [
-        *restarts,
-        Stage("best_jmvae", _best_jmvae, {"restarts": names, **given}, is_kept=True),
-        Stage("class_beliefs", class_beliefs, {"params": "best_jmvae", **given}, is_kept=True),
-    ]
+    return stage.restarts(config, untrained=untrained, problem=problem)
 
 
-def _best_jmvae(
+def best(
     key: Key,
     config: Config,
     *,
@@ -62,8 +55,8 @@ def _best_jmvae(
     inexact = jnp.maximum(errors - _EXACT, 0.0)
     is_finite = jnp.isfinite(losses) & jnp.isfinite(inexact)
     worst_last = [jnp.where(is_finite, x, jnp.inf) for x in (losses, inexact)]
-    best = jnp.lexsort(worst_last)[0]
-    return jax.tree.map(lambda x: x[best], params)
+    found = jnp.lexsort(worst_last)[0]
+    return jax.tree.map(lambda x: x[found], params)
 
 
 def class_beliefs(key: Key, config: Config, *, params: Params, detections: Detections) -> Belief:

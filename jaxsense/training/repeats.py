@@ -1,6 +1,6 @@
 """The stage that learns how much of a repeated look is new."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -36,22 +36,14 @@ class Repeated:
 
 
 def random_scenes(key: Key, config: Config) -> Repeated:
-    """Scenes with PoIs of random classes, which are known.
-
-    Args:
-      key: random key.
-      config: all settings.
-    """
+    """Scenes with PoIs of random classes, which are known."""
     shape = config.detector.num_repeats, config.arena.num_pois
     classes = jax.random.randint(key, shape, 0, len(config.arena.classes))
     return Repeated(classes, None, classes[:, 0])
 
 
 def novelty_stage(
-    arena: Arena,
-    config: Config,
-    scenes: Callable[..., Repeated] = random_scenes,
-    inputs: Mapping[str, str] | None = None,
+    arena: Arena, config: Config, scenes: Callable[..., Repeated] = random_scenes
 ) -> Stage:
     """Makes the stage that learns how much of a look is new; all of it if there are no such scenes.
 
@@ -59,18 +51,14 @@ def novelty_stage(
       arena: of the simulation.
       config: all settings.
       scenes: `(key, config, **inputs) -> Repeated`, with `detector.num_repeats` scenes.
-      inputs: what `scenes` takes, see `Stage`; nothing by default.
     """
     number = config.detector.num_repeats
-    if not number:
-        num_modalities = len(config.modalities)
-        return Stage(
-            "novelty", lambda key, config: novelty.independent(num_modalities), is_kept=True
-        )
 
     def begin(
         key: Key, config: Config, *, trained: tuple[Detector, ...], **given: Output
     ) -> Novelty:
+        if not number:
+            return novelty.independent(len(trained))
         world, exact = make_world(config, arena=arena), make_bayes(config)
         class_key, *keys = jax.random.split(key, 1 + len(trained))
         drawn = scenes(class_key, config, **given)
@@ -86,5 +74,4 @@ def novelty_stage(
         strength, length = zip(*map(fit, range(len(trained))), strict=True)
         return Novelty(jnp.stack(strength), jnp.stack(length))
 
-    names = tuple(f"detector_{name}" for name in config.modalities)
-    return Stage("novelty", begin, {"trained": names, **(inputs or {})}, is_kept=True)
+    return Stage("novelty", begin)

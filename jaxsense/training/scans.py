@@ -18,13 +18,11 @@ from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_frame, make_prior, make_readout, make_shape
 from jaxsense.sim import sensors
-from jaxsense.sim.arena import Arena
-from jaxsense.training import detections, gating, repeats
+from jaxsense.training import detections, gating, stage
 from jaxsense.training.detections import Detections
-from jaxsense.training.fits import fit_stage, jmvae_restarts
 from jaxsense.training.gating import Examples
 from jaxsense.training.repeats import Repeated
-from jaxsense.training.stage import Stage
+from jaxsense.training.stage import Stage, fit_stage
 from jaxsense.training.surveys import Scenes, Survey, Surveys, num_scenes
 from jaxsense.vae import clusters, frames, leave_one_out
 from jaxsense.vae import gate as gates
@@ -59,27 +57,6 @@ class Views:
 
     groups: Groups
     scalings: tuple[Scaling, ...]
-
-
-def make_stages(config: Config, arena: Arena) -> list[Stage]:
-    """Makes the stages from surveys to detections and novelty."""
-    detectors = tuple(f"detector_{name}" for name in config.modalities)
-    learned = {"params": "best_jmvae", "views": "views"}
-    restarts = _jmvae_stages(config)
-    best = {"restarts": tuple(stage.name for stage in restarts)}
-    clustered = {**learned, "surveys": "survey", "classes": "class_beliefs"}
-    detected = {"surveys": "survey", "trained": detectors, "shown": "shown"}
-    return [
-        Stage("views", views, {"surveys": "survey"}, is_passing=True),
-        *restarts,
-        Stage("best_jmvae", _best, best, is_kept=True),
-        Stage("class_beliefs", class_beliefs, {**learned, "surveys": "survey"}, is_kept=True),
-        Stage("shown", shown, clustered),
-        *(_encoder_stage(m, name, config) for m, name in enumerate(detectors)),
-        Stage("detections", detect, detected),
-        Stage("grouped", accuracies, clustered),
-        repeats.novelty_stage(arena, config, repeated, {"scenes": "scenes", "shown": "shown"}),
-    ]
 
 
 def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
@@ -119,24 +96,25 @@ def grouped(windows: Float[Array, "S N F"], config: Config) -> Float[Array, "P K
     return jnp.swapaxes(windows.reshape(-1, looks, num_pois, size), 1, 2).reshape(-1, looks, size)
 
 
-def _jmvae_stages(config: Config) -> list[Stage]:
-    """Trainings from different random parameters."""
+def restarts(config: Config) -> list[Stage]:
+    """Makes the stages that train the JMVAE from different random parameters."""
 
-    def problem(config: Config, *, views: Views) -> leave_one_out.Fitting:
+    def untrained(key: Key, config: Config, *, views: Views) -> tuple[tuple[()], Params]:
+        del views
+        return (), leave_one_out.init(key, make_shape(config))
+
+    def problem(config: Config, _: tuple[()], *, views: Views) -> leave_one_out.Fitting:
         return leave_one_out.Fitting(config.jmvae, views.groups, make_shape(config))
 
-    def init(key: Key, config: Config) -> Params:
-        return leave_one_out.init(key, make_shape(config))
-
-    return jmvae_restarts(config, {"views": "views"}, init=init, problem=problem)
+    return stage.restarts(config, untrained=untrained, problem=problem)
 
 
-def _best(key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]) -> Params:
+def best(key: Key, config: Config, *, restarts: tuple[tuple[Params, jax.Array], ...]) -> Params:
     """Parameters of the restart with the lowest finite loss; of the first if none is finite."""
     losses = jnp.stack([loss for _, loss in restarts])
-    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
+    found = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
     params = jax.tree.map(lambda *x: jnp.stack(x), *(params for params, _ in restarts))
-    return jax.tree.map(lambda x: x[best], params)
+    return jax.tree.map(lambda x: x[found], params)
 
 
 def _posteriors(params: Params, config: Config, groups: Groups) -> Belief:
@@ -170,8 +148,8 @@ def class_beliefs(
     return jax.tree.map(lambda x: jnp.sum(share[..., None] * x[None], axis=1), found)
 
 
-def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
-    """The stage that makes a detector of the encoder of one modality, and trains its gate."""
+def encoder_stage(modality: int, config: Config) -> Stage:
+    """Makes the stage that makes a detector of one modality's encoder, and trains its gate."""
 
     def num_looks(config: Config) -> int:
         return _num_training(config) * config.arena.num_pois
@@ -233,17 +211,8 @@ def _encoder_stage(modality: int, name: str, config: Config) -> Stage:
         return dataclasses.replace(encoder, gate=gates.fitted(fit.params, checks))
 
     return fit_stage(
-        name,
-        {
-            "surveys": "survey",
-            "examples": "examples",
-            "params": "best_jmvae",
-            "views": "views",
-            "classes": "class_beliefs",
-            "shown": "shown",
-        },
-        config,
-        settings=lambda config: config.detector,
+        f"detector_{config.modalities[modality]}",
+        config.detector,
         untrained=untrained,
         problem=problem,
         trained=trained,

@@ -1,16 +1,20 @@
-"""The list of all stages of a training, and its composition.
+"""The whole training, from top to bottom.
 
-`learn` composes the list into one pure function, which you can `vmap` over seeds and settings.
-`jaxsense.run` executes the same list from the host with the same keys; between two chunks it
-reports, saves, and stops if asked to.
+`learn` executes it as one pure function, which you can `vmap` over seeds and settings.
+`jaxsense.run` executes it from the host with the same keys; between two chunks it reports, saves,
+and stops if asked to.
 """
 
+import contextlib
 from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from jaxsense.config import Config
 from jaxsense.core import checks
-from jaxsense.core.types import Key
-from jaxsense.models import Models, make_models
+from jaxsense.core.types import Key, pytree
+from jaxsense.models import Models, make_agent, make_models
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import (
@@ -24,63 +28,111 @@ from jaxsense.training import (
     scans,
     surveys,
 )
-from jaxsense.training.stage import Learned, Output, Stage, compose, key_of
+from jaxsense.training.stage import Drive, Output, Progress, Stage, is_finite, key_of, scan
 
 
-def _from_detections(config: Config, arena: Arena) -> list[Stage]:
-    """The stages from surveys to class beliefs and novelty; see `scans.make_stages`."""
-    return [
-        *detections.make_stages(config),
-        *jmvaes.make_stages(config),
-        repeats.novelty_stage(arena, config),
-    ]
+@pytree
+class Learned:
+    """Result of `learn`: the outputs of all stages, and their losses.
+
+    Attributes:
+      outputs: of every stage, by its name.
+      progress: `[steps]` of every stage that has steps, by its name.
+      is_finite: `[]` bool, whether all losses and outputs are finite; optional stages are ignored.
+    """
+
+    outputs: dict[str, Output]
+    progress: dict[str, Progress]
+    is_finite: Bool[Array, ""]
 
 
-_LEARNS_FROM = {"detections": _from_detections, "scans": scans.make_stages}
+def train(drive: Drive, config: Config, arena: Arena) -> None:
+    """The training. Outputs pass through `drive` alone, so that it may return anything for them.
+
+    Args:
+      drive: executes each stage, and keeps what is needed of its output.
+      config: all settings; its static fields determine the stages and all sizes.
+      arena: from `sim.make_world(config)`.
+    """
+    scenes = drive(Stage("scenes", surveys.draw_scenes))
+    surveyed = drive(surveys.survey_stage(arena), scenes=scenes)
+    examples = drive(Stage("examples", detections.split_examples), surveys=surveyed)
+    perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
+    detectors, params, classes, detected = perceive(
+        drive, config, arena, scenes=scenes, surveys=surveyed, examples=examples
+    )
+    known = {"detections": detected}
+    drive(Stage("detector_metrics", measures.detector_metrics), **known)
+
+    fusion = fusions.train(drive, config, params=params, classes=classes, **known)
+    known["fusion"] = fusion
+    drive(Stage("latent_space", measures.latent_space), **known)
+    solve = Stage("look_values", agents.look_values)
+    values = drive(solve, classes=classes, detections=detected)
+    drive(Stage("beliefs", measures.beliefs), **known)
+
+    networks = agents.train(drive, config, arena, detectors=detectors, look_values=values, **known)
+    for m, name in enumerate(config.modalities):
+        network = networks[agents.learner(config, name)]
+        given = {"modality": jnp.int32(m), "q_network": network, "look_values": values, **known}
+        drive(Stage(f"policies_{name}", comparison.play_policies, shares="policies"), **given)
+        if config.evaluation.num_pois:
+            drive(Stage(f"numbers_{name}", comparison.play_numbers, shares="numbers"), **given)
+
+
+def _learn_from_detections(
+    drive: Drive, config: Config, arena: Arena, *, scenes: Output, surveys: Output, examples: Output
+) -> tuple[Output, Output, Output, Output]:
+    """Detectors, parameters of the JMVAE, class beliefs and detections; see `scans`."""
+    del scenes
+    given = {"surveys": surveys, "examples": examples}
+    stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
+    trained = tuple(drive(stage, **given) for stage in stages)
+    detected = drive(Stage("detections", detections.detect), surveys=surveys, trained=trained)
+    each = tuple(drive(stage, detections=detected) for stage in jmvaes.restarts(config))
+    choose = Stage("best_jmvae", jmvaes.best)
+    params = drive(choose, restarts=each, detections=detected)
+    average = Stage("class_beliefs", jmvaes.class_beliefs)
+    classes = drive(average, params=params, detections=detected)
+    drive(repeats.novelty_stage(arena, config), trained=trained)
+    return trained, params, classes, detected
+
+
+def _learn_from_scans(
+    drive: Drive, config: Config, arena: Arena, *, scenes: Output, surveys: Output, examples: Output
+) -> tuple[Output, Output, Output, Output]:
+    """The same of a JMVAE that learns from scans, and whose encoders serve as detectors."""
+    seen = drive(Stage("views", scans.views), surveys=surveys)
+    each = tuple(drive(stage, views=seen) for stage in scans.restarts(config))
+    params = drive(Stage("best_jmvae", scans.best), restarts=each)
+    learned = {"params": params, "views": seen, "surveys": surveys}
+    classes = drive(Stage("class_beliefs", scans.class_beliefs), **learned)
+    learned["classes"] = classes
+    shown = drive(Stage("shown", scans.shown), **learned)
+    stages = [scans.encoder_stage(m, config) for m in range(len(config.modalities))]
+    trained = tuple(drive(stage, examples=examples, shown=shown, **learned) for stage in stages)
+    find = Stage("detections", scans.detect)
+    detected = drive(find, surveys=surveys, trained=trained, shown=shown)
+    drive(Stage("grouped", scans.accuracies), **learned)
+    novelty = repeats.novelty_stage(arena, config, scans.repeated)
+    drive(novelty, trained=trained, scenes=scenes, shown=shown)
+    return trained, params, classes, detected
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
-    """Stages of a training, each after the stages whose outputs it takes.
+    """The stages of a training, in the order of `train`.
 
     Args:
-      config: all settings; its static fields determine the stages and all sizes.
-      arena: from `sim.make_world(config)`; compiled anew by default.
+      config: all settings.
+      arena: as in `learn`.
     """
-    arena = make_world(config).arena if arena is None else arena
-    detected, fusion = {"detections": "detections"}, {"fusion": "fusion"}
-    classes = {"classes": "class_beliefs"}
-    policies = {
-        name: {
-            "modality": m,
-            "q_network": agents.learner(config, name),
-            "look_values": "look_values",
-            **fusion,
-            **detected,
-        }
-        for m, name in enumerate(config.modalities)
-    }
-    return [
-        Stage("scenes", surveys.draw_scenes, is_passing=True),
-        surveys.survey_stage(arena),
-        Stage("examples", detections.split_examples, {"surveys": "survey"}, is_passing=True),
-        *_LEARNS_FROM[config.jmvae.learns_from](config, arena),
-        Stage("detector_metrics", measures.detector_metrics, detected),
-        *fusions.make_stages(config),
-        Stage("latent_space", measures.latent_space, {**fusion, **detected}),
-        Stage("look_values", agents.look_values, {**classes, **detected}, is_kept=True),
-        Stage("beliefs", measures.beliefs, {**fusion, **detected}),
-        *agents.agent_stages(arena, config),
-        *agents.tour_stages(config),
-        *(
-            Stage(f"policies_{name}", comparison.play_policies, inputs, shares="policies")
-            for name, inputs in policies.items()
-        ),
-        *(
-            Stage(f"numbers_{name}", comparison.play_numbers, inputs, shares="numbers")
-            for name, inputs in policies.items()
-            if config.evaluation.num_pois
-        ),
-    ]
+    found: list[Stage] = []
+    train(lambda stage, **_: found.append(stage), config, _arena(config, arena))
+    return found
+
+
+class _EnoughError(Exception):
+    """Ends a training after the stage that was named."""
 
 
 @checks.typed
@@ -103,11 +155,30 @@ def learn(
       ValueError: if `config` is no `Config`, or no stage has this name.
     """
     checks.require_key(key)
-    found = stages(config, arena)
-    names = [stage.name for stage in found]
+    arena = _arena(config, arena)
+    names = [stage.name for stage in stages(config, arena)]
     if until is not None and until not in names:
         raise ValueError(f"until = {until!r}: must be one of {', '.join(names)}")
-    return compose(key, config, found[: None if until is None else names.index(until) + 1])
+    outputs, progress, finite = dict[str, Output](), dict[str, Progress](), [jnp.bool_(True)]
+
+    def drive(stage: Stage, **inputs: Output) -> Output:
+        outputs[stage.name], steps = scan(key, config, stage, inputs)
+        if steps is not None:
+            progress[stage.name] = steps
+        if not stage.is_optional:
+            losses = () if steps is None else steps.loss
+            finite.append(is_finite((outputs[stage.name], losses)))
+        if stage.name == until:
+            raise _EnoughError
+        return outputs[stage.name]
+
+    with contextlib.suppress(_EnoughError):
+        train(drive, config, arena)
+    return Learned(outputs, progress, jnp.stack(finite).all())
+
+
+def _arena(config: Config, arena: Arena | None) -> Arena:
+    return make_world(config).arena if arena is None else arena
 
 
 def models(outputs: Mapping[str, Output], config: Config) -> Models:
@@ -125,7 +196,7 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
         novelty=outputs["novelty"],
         look_values=outputs["look_values"],
         q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
-        tours=tuple(outputs[stage.name] for stage in agents.tour_stages(config)),
+        tours=tuple(outputs["tours"] for _ in make_agent(config).tour_networks),
     )
 
 

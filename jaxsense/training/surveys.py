@@ -138,16 +138,10 @@ def survey_stage(arena: Arena) -> Stage:
         seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
         return Survey(classes, seen, windows, distances)
 
-    given = {"scenes": "scenes"}
-    return Stage("survey", survey, given, divide=divide, is_passing=True, has_rows=True)
+    return Stage("survey", survey, finish=divide)
 
 
-def divide(config: Config, survey: Survey) -> Surveys:
-    """Divides the survey of all scenes by what it is for.
-
-    Args:
-      config: all settings.
-      survey: of all scenes.
-    """
+def divide(config: Config, survey: Survey, **_: Scenes) -> Surveys:
+    """Divides the survey of all scenes by what it is for."""
     number = num_scenes(config)[0]
     return Surveys(survey.of_scenes(slice(number)), survey.of_scenes(slice(number, None)))

@@ -1,9 +1,7 @@
 """Policies of missions: those of the table, and one of the user's own."""
 
 import contextlib
-from concurrent.futures import Future
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +15,6 @@ from jaxsense.dqn.policies import Policy
 from jaxsense.mission import choice, decide
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import output, pipeline, programs
-from jaxsense.run.compilation import Compiler
-from jaxsense.run.devices import ALONE
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.sim import arena as arenas
 
@@ -198,23 +194,16 @@ def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
 
 
 def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
-    monkeypatch.setattr(programs, "_trace", lambda run, compiler: None)
+    played = lambda mission, compiler, batch, workers, runs_long: mission  # noqa: E731
+    monkeypatch.setattr(programs.missions, "Player", played)
+    monkeypatch.setattr(programs.stages, "train", lambda drive, config, arena: None)
     with pipeline.compiled(playing("mine"), Monitor(), policies=OWN) as made:
-        assert made.policies == OWN
+        assert [*made.player.result().policies] == [*POLICIES, *OWN]
     with (
         pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"),
         pipeline.compiled(playing("mine"), Monitor()),
     ):
         pass
-
-
-def test_own_policies_reach_the_missions_of_a_run(team, monkeypatch):
-    played = lambda mission, compiler, batch, workers, runs_long: mission  # noqa: E731
-    monkeypatch.setattr(programs.missions, "Player", played)
-    run = SimpleNamespace(config=CONFIG, policies=OWN, workers=ALONE, player=Future())
-    with Compiler(Monitor()) as compiler:
-        programs._trace_missions(run, compiler)  # pyright: ignore[reportArgumentType]
-    assert [*run.player.result().policies] == [*POLICIES, *OWN]
 
 
 def test_evaluate_plays_own_policies_and_keeps_no_programs(tmp_path, monkeypatch, models, capsys):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, TINY, stage_of
+from tiny import KEY, TINY, inputs_of, sources_of, stage_of
 
 from jaxsense import models
 from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
@@ -112,7 +112,7 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
         "detections": detections_of(bank, held_out, starts),
         **dict(zip(("detector_camera", "detector_lidar"), untrained.detectors, strict=True)),
     }
-    inputs = stage.select(found)
+    inputs = inputs_of(name, BANK, found)
     _, progress = stage.advance(KEY, BANK, "state", **inputs)
     number = int(name == "dqn_lidar")
     assert used["of"] == (number, "network")
@@ -128,7 +128,7 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
 def test_the_network_of_a_team_is_evaluated_with_its_first_sensor():
     team = dataclasses.replace(BANK, dqn=dataclasses.replace(BANK.dqn, task="team"))
     # As its curve is titled, beside the optimum of that sensor, see `learning_plots.rewards`.
-    assert stage_of("dqn_team", team).inputs["modality"] == 0
+    assert sources_of(team)["dqn_team"]["modality"] == 0
 
 
 TOURS = dataclasses.replace(

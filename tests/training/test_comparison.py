@@ -14,7 +14,7 @@ from jaxsense.dqn import map_mdp, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae, make_prior
 from jaxsense.training import comparison
-from jaxsense.training.mdp import held_out_mdp, models_of
+from jaxsense.training.comparison import held_out_mdp, models_of
 from jaxsense.vae import filter
 
 NUM_STATES = 1728  # 3^3 x 2^6

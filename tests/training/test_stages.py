@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, TINY
+from tiny import KEY, TINY, inputs_of
 
 import jaxsense
 from jaxsense import training
-from jaxsense.run import loop, missions, pipeline
+from jaxsense.run import loop, pipeline
 from jaxsense.run.monitor import Monitor
+from jaxsense.run.programs import Programs
 from jaxsense.training import learn
 
 TOLERANCE = 1e-5
@@ -34,12 +35,11 @@ def trained(request):
     """The programs of a run, and what they have trained."""
     monitor = Monitor()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(missions, "Player", lambda *given: None)  # none is played
+        patch.setattr(Programs, "_compile_missions", lambda programs: None)  # none is played
         with pipeline.compiled(with_observe(request.param), monitor) as programs:
             # A run lets go of what no later stage needs; here, every output is compared.
-            kept = [dataclasses.replace(stage, is_passing=False) for stage in programs.stages]
-            whole = dataclasses.replace(programs, stages=kept)
-            yield whole, loop.train(KEY, whole.config, whole, monitor)
+            patch.setattr(loop, "_ONLY_PASSED_ON", ())
+            yield programs, loop.train(KEY, programs.config, programs, monitor)
 
 
 def first_chunk(stage, begin_key, chunk_key, config, inputs):
@@ -56,9 +56,10 @@ def test_every_stage_of_learn_is_that_of_a_run(trained):
     programs, found = trained
     keys, config, together = jnp.stack([KEY, jax.random.key(8)]), programs.config, {}
     for stage in programs.stages:
-        inputs, compiled = stage.select(found.outputs), programs.of(stage)
+        inputs = inputs_of(stage.name, config, found.outputs)
+        compiled = programs.of(stage)
         begin_keys, chunk_keys = jax.vmap(stage.key)(keys), keys
-        if stage.has_rows:
+        if stage.name == "survey":
             inputs = jax.tree.map(lambda x: x[:2], inputs)
             of_run = jax.tree.map(lambda x: x[:2], found.outputs[stage.name].training)
         elif stage.chunks:

@@ -80,7 +80,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
     monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
-    divided = listed["survey"].divide(MEASURED, surveys)
+    divided = listed["survey"].finish(MEASURED, surveys)
     examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=divided)
     given = {"surveys": divided, "examples": examples}
     for name in ("detector_camera", "detector_lidar"):

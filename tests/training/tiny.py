@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from jaxsense import training
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MissionConfig
-from jaxsense.training.stage import Stage
+from jaxsense.sim.world import make_world
+from jaxsense.training.stage import is_finite, scan
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)
 # Learning is chaotic, and two programs round differently: a few steps.
@@ -23,21 +24,37 @@ TINY = dataclasses.replace(
 )  # fmt: skip
 
 
+def sources_of(config):
+    """For each stage the names of those whose outputs are its inputs, by argument."""
+    found = {}
+
+    def drive(stage, **inputs):
+        found[stage.name] = inputs
+        return stage.name
+
+    training.stages.train(drive, config, make_world(config).arena)
+    return found
+
+
+def inputs_of(name, config, outputs):
+    """Inputs of a stage, from the outputs of all."""
+    sources = sources_of(config)[name]
+    return jax.tree.map(lambda x: outputs[x] if isinstance(x, str) else x, sources)
+
+
 def learn_by_stages(key, config, until):
     """As `learn`, but each stage in a program of its own: one for all takes XLA twice as long."""
-    outputs, is_finite = training.stage.Outputs(), []
-    for stage in training.stages.stages(config):
+    outputs, finite = {}, []
 
-        def run(taken, stage=stage):
-            given = [Stage(name, lambda key, config, x=x: x) for name, x in taken.items()]
-            found = training.stage.compose(key, config, [*given, stage])
-            return found.outputs[stage.name], found.is_finite
+    def drive(stage, **inputs):
+        if until in outputs:
+            return None
+        outputs[stage.name] = jax.jit(lambda x: scan(key, config, stage, x)[0])(inputs)
+        finite.append(is_finite(outputs[stage.name]))
+        return outputs[stage.name]
 
-        outputs[stage.name], finite = jax.jit(run)({name: outputs[name] for name in stage.sources})
-        is_finite.append(finite)
-        if stage.name == until:
-            break
-    return training.stage.Learned(outputs, {}, jnp.stack(is_finite).all())
+    training.stages.train(drive, config, make_world(config).arena)
+    return training.Learned(outputs, {}, jnp.stack(finite).all())
 
 
 def stage_of(name, config=TINY):

@@ -18,7 +18,7 @@ from jaxsense.config import (
 )
 from jaxsense.training import fusions, jmvaes, measures
 from jaxsense.training.detections import Detections
-from jaxsense.training.stage import Stage, compose
+from jaxsense.training.stage import Stage, scan
 
 SHAPES = {
     "cylinder": Shape("cylinder"),
@@ -114,13 +114,14 @@ def detections_of(config, accuracy=ACCURACY):
 @jax.jit
 def learn(key, config, detections):
     """Outputs of all stages from the JMVAE to the beliefs."""
-    given, fusion = {"detections": "detections"}, {"fusion": "fusion"}
-    stages = [
-        Stage("detections", lambda key, config: detections),
-        *jmvaes.make_stages(config),
-        *fusions.make_stages(config),
-        Stage("latent_space", measures.latent_space, {**fusion, **given}),
-        Stage("beliefs", measures.beliefs, {**fusion, **given}),
-    ]
-    outputs = compose(key, config, stages).outputs
-    return outputs["latent_space"][1], outputs["beliefs"]
+
+    def drive(stage, **inputs):
+        return scan(key, config, stage, inputs)[0]
+
+    given = {"detections": detections}
+    restarts = tuple(drive(stage, **given) for stage in jmvaes.restarts(config))
+    params = drive(Stage("best_jmvae", jmvaes.best), restarts=restarts, **given)
+    classes = drive(Stage("class_beliefs", jmvaes.class_beliefs), params=params, **given)
+    fusion = fusions.train(drive, config, params=params, classes=classes, **given)
+    _, latent = drive(Stage("latent_space", measures.latent_space), fusion=fusion, **given)
+    return latent, drive(Stage("beliefs", measures.beliefs), fusion=fusion, **given)
