@@ -297,7 +297,7 @@ def _train_one(
         try:
             learned = pipeline.learn(key, config, programs, monitor, checkpoints)
             drawn = [artist.submit(lambda: _drawing().of_training(config, learned))]
-            played = pipeline.play(key, config, programs, monitor, learned, checkpoints)
+            played = pipeline.play(key, config, programs, learned, checkpoints)
         except StageError as error:
             _warn(f"{error}; earlier checkpoints are in {run.path}")
             return {run.settings.seed: str(error)}

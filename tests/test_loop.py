@@ -1,9 +1,6 @@
 """The loop that drives the stages of a training from the host."""
 
 import gc
-import signal
-import subprocess
-import sys
 import time
 import weakref
 from types import SimpleNamespace
@@ -282,7 +279,7 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
         if stage.name == "full":
             raise OSError(28, "No space left on device")
         for _ in range(1000):
-            if self._monitor.is_stopping:
+            if self.monitor.is_stopping:
                 return begin(self, stage, inputs)
             time.sleep(0.01)
         raise AssertionError("it was not stopped")
@@ -292,102 +289,64 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
         toy(lambda drive: (count(drive), drive(Stage("full", lambda key, config: jnp.zeros(2)))))
 
 
-def chunked(name, chunks, **settings):
-    return Stage(name, lambda key, config: (), chunks=chunks, **settings)
+def go_on(path, chunks, run, monitor=None):
+    """Runs a training whose state and metric count its chunks."""
+
+    def counted(chunk, state):
+        run(chunk)
+        return state + 1, {"chunk": [chunk]}
+
+    stage = Stage("jmvae", lambda key, config: (), chunks=chunks)
+    return run_chunks(stage, np.float32(0), counted, monitor or Monitor(), Checkpoints(path))
+
+
+def saved(path, chunks):
+    return Checkpoints(path).load_unfinished("jmvae", np.float32(0), chunks)
 
 
 def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
-    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
+    monitor = Monitor()
 
-    def run(chunk, state):
+    def run(chunk):
         monitor.report("jmvae", chunk + 1, 4, np.array([np.nan if chunk == 2 else 1.0]))
-        return {"x": state["x"] + 1}, {"chunk": [chunk]}
 
-    start = {"x": np.zeros(2, np.float32)}
     with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
-        run_chunks(chunked("jmvae", 4), start, run, monitor, checkpoints)
-    done, state, curves = checkpoints.load_unfinished("jmvae", start, 4)
-    assert (done, curves) == (2, {"chunk": [0, 1]})
-    np.testing.assert_array_equal(state["x"], [2, 2])
+        go_on(tmp_path, 4, run)
+    assert saved(tmp_path, 4) == (2, 2, {"chunk": [0, 1]})
 
 
-KILLED = """
-import os, signal, sys, time
-from pathlib import Path
-import numpy as np
-from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.compilation import Program
-from jaxsense.run.kept import Kept
-from jaxsense.run.loop import run_chunks
-from jaxsense.run.monitor import Monitor
-from jaxsense.training.stage import Stage
+def test_a_killed_training_loses_no_more_than_a_minute(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
 
-clock = [0.0]
-time.monotonic = lambda: clock[0]
+    def run(chunk):
+        clock[0] += 25.0
+        if chunk == 5:
+            raise KeyboardInterrupt
 
-def run(chunk, state):
-    if chunk == 5:
-        os.kill(os.getpid(), signal.SIGKILL)
-    clock[0] += 25.0
-    return state + 1, {"chunk": [chunk]}
-
-stage = Stage("jmvae", lambda key, config: (), chunks=9)
-run_chunks(stage, np.float32(0), run, Monitor(), Checkpoints(Path(sys.argv[1])))
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")
-def test_a_killed_training_loses_no_more_than_a_minute(tmp_path):
     # Five chunks of 25 s: it is saved after 75 s, and would be after 150 s.
-    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
-    assert ended.returncode == -signal.SIGKILL
-    state = np.float32(0)
-    done, state, curves = Checkpoints(tmp_path).load_unfinished("jmvae", state, 9)
-    assert (done, state, curves) == (3, 3, {"chunk": [0, 1, 2]})
+    with pytest.raises(KeyboardInterrupt):
+        go_on(tmp_path, 9, run)
+    assert saved(tmp_path, 9) == (3, 3, {"chunk": [0, 1, 2]})
 
 
-def test_a_stop_is_heard_after_every_chunk(tmp_path):
-    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
-
-    def run(chunk, state):
-        if chunk == 1:
-            monitor.stop()
-        return state + 1, {}
-
+def test_a_stop_is_heard_after_every_chunk_and_what_is_over_is_saved(tmp_path):
+    monitor = Monitor()
     with pytest.raises(Stopped):
-        run_chunks(chunked("jmvae", 4), np.float32(0), run, monitor, checkpoints)
-    assert checkpoints.load_unfinished("jmvae", np.float32(0), 4)[:2] == (2, 2.0)
-
-
-def test_a_training_that_is_over_is_saved_when_another_one_stops(tmp_path):
-    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
-    monitor.stop()
-    state, curves = run_chunks(
-        chunked("camera", 1),
-        np.float32(0),
-        lambda i, x: (x + 1, {"i": [i]}),
-        monitor,
-        checkpoints,
-    )
-    assert (state, curves) == (1, {"i": [0]})
-
-    def never(chunk, state):
-        raise AssertionError("trained again")
-
-    again = run_chunks(chunked("camera", 1), np.float32(0), never, Monitor(), checkpoints)
-    assert again == (1, {"i": [0]})
+        go_on(tmp_path, 4, lambda chunk: chunk == 1 and monitor.stop(), monitor)
+    assert saved(tmp_path, 4) == (2, 2, {"chunk": [0, 1]})
+    chunks = []
+    assert go_on(tmp_path, 3, chunks.append, monitor) == (3, {"chunk": [0, 1, 2]})
+    assert chunks == [2]
+    assert go_on(tmp_path, 3, lambda chunk: pytest.fail("trained again"))[0] == 3
 
 
 def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
-    checkpoints, monitor = Checkpoints(tmp_path), Monitor()
-
-    def run(chunk, state):
-        monitor.fail(StageError("dqn_lidar: loss = nan at step 7 of 40"))
-        return state + 1, {}
-
+    monitor = Monitor()
+    fail = lambda chunk: monitor.fail(StageError("dqn_lidar: loss = nan"))  # noqa: E731
     with pytest.raises(StageError, match="dqn_lidar"):
-        run_chunks(chunked("dqn_camera", 9), np.float32(0), run, monitor, checkpoints)
-    assert checkpoints.load_unfinished("dqn_camera", np.float32(0), 9)[:2] == (1, 1.0)
+        go_on(tmp_path, 9, fail, monitor)
+    assert saved(tmp_path, 9)[:2] == (1, 1)
     monitor.begin(lambda *_: None)  # the next seed
     monitor.check_stop()
 
@@ -396,11 +355,9 @@ def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
     def full(*_):
         raise OSError(28, "No space left on device", "jmvae.msgpack")
 
-    checkpoints = Checkpoints(tmp_path)
-    monkeypatch.setattr(checkpoints, "save_unfinished", full)
-
-    def run(chunk, state):
+    def run(chunk):
         raise StageError("jmvae: loss = nan at step 1 of 4")
 
+    monkeypatch.setattr(Checkpoints, "save_unfinished", full)
     with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
-        run_chunks(chunked("jmvae", 4), np.float32(0), run, Monitor(), checkpoints)
+        go_on(tmp_path, 4, run)

@@ -16,14 +16,7 @@ from jaxsense.run.monitor import Monitor
 
 
 class Compiler:
-    """Compiles the programs of a run in its own threads, until the end of the block.
-
-    Attributes:
-      monitor: measures compile times.
-      kept: cache of traced programs, if any.
-      threads: compile.
-      is_closed: whether the run is over.
-    """
+    """Compiles the programs of a run in its own threads, until the end of the block."""
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
         self.monitor, self.kept, self.is_closed = monitor, kept, False
@@ -45,13 +38,6 @@ class Program:
     """
 
     def __init__(self, compiler: Compiler, stage: str, name: str):
-        """Names a program.
-
-        Args:
-          compiler: compiles it.
-          stage: to which it belongs.
-          name: unique within the stage.
-        """
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name = stage, name
         self._compiled: Future[Function] = Future()
@@ -70,7 +56,7 @@ class Program:
 
         Args:
           function: what to compile.
-          *args: arguments or their shapes, for example the result of another program's `compile`.
+          *args: arguments or their shapes, for example what another program's `compile` returns.
           workers: share the rows of the arguments.
           whole: positions of arguments that every worker gets undivided.
           **options: see `devices.compiler_options`.
@@ -183,12 +169,7 @@ class Program:
         self._compiled = released
 
     def wait(self) -> Function:
-        """Blocks until the program is compiled.
-
-        Raises:
-          Stopped: if the run must stop.
-          StageError: if a concurrent stage failed.
-        """
+        """Blocks until the program is compiled; raises what `Monitor.check_stop` does."""
         if not self._compiled.done():
             self._monitor.announce(self._stage)
             return self._monitor.wait_for(self._compiled)

@@ -1,11 +1,14 @@
-"""Keeps traced programs, and JAX's compilation cache, in a directory for later runs."""
+"""Keeps traced programs, and JAX's compilation cache, in a directory for later runs.
+
+JAX's cache finds compiled programs by their traces. Tracing takes as long as everything else, so
+another directory holds the traces, found by all that tracing depends on.
+"""
 
 import contextlib
 import functools
 import hashlib
 import os
 import pickle
-import re
 import stat
 import warnings
 from collections.abc import Callable
@@ -23,7 +26,7 @@ Function: TypeAlias = Callable[..., PyTree]
 
 _MAX_KEPT = 512  # traced programs; a run has about twenty
 _MAX_BYTES = 2**31  # of compiled programs
-_FILE = re.compile(r".+-[0-9a-f]{32}\.stablehlo")
+_SUFFIX = f"-{32 * '[0-9a-f]'}.stablehlo"
 
 
 class Traced(NamedTuple):
@@ -49,20 +52,17 @@ class Traced(NamedTuple):
 
 
 class Kept:
-    """Cache of traced programs in a directory.
-
-    JAX's compilation cache finds compiled programs by their traces. Tracing takes as long as
-    everything else, so this directory holds the traces, found by all that tracing depends on.
+    """Cache of traced programs.
 
     Attributes:
-      path: the directory of traced programs.
+      path: its directory.
     """
 
     def __init__(self, directory: Path, *settings: object):
         """Opens the cache, and removes the least recently used programs.
 
         Args:
-          directory: holds the traced programs.
+          directory: holds the cache, in `traced`.
           *settings: everything outside jaxsense's source that programs close over, as values whose
             `repr` tells them apart.
 
@@ -75,47 +75,13 @@ class Kept:
         self._depends = repr((settings, _surroundings())).encode()
         # Another run may be removing some too.
         with contextlib.suppress(FileNotFoundError):
-            self._forget_oldest()
-
-    def _forget_oldest(self) -> None:
-        """Removes the least recently used programs, and no other file."""
-        ours = [
-            path
-            for path in self.path.iterdir()
-            if _FILE.fullmatch(path.name) and path.is_file() and not path.is_symlink()
-        ]
-        for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
-            path.unlink(missing_ok=True)
-        files.remove_unfinished(self.path)
-
-    def find(self, name: str, args: PyTree) -> Traced | None:
-        """Finds a cached program.
-
-        Args:
-          name: of the program.
-          args: its arguments or their shapes.
-
-        Returns:
-          The program; None if its file is missing or, with a line to standard error, damaged.
-        """
-        path = self._file(name, args)
-        try:
-            with path.open("rb") as file:
-                if not _is_private(os.fstat(file.fileno()), 0o022):
-                    raise PermissionError("other users may have written it")
-                content = file.read()
-            # A single wrong bit could end the process.
-            structure, flat = pickle.loads(files.without_digest(content))
-            found = Traced(export.deserialize(bytearray(flat)), structure)
-            path.touch()
-            return found
-        except FileNotFoundError:
-            return None
-        except Exception as error:  # tracing the program again repairs any file
-            return self._tell(error)
+            ours = [x for x in self.path.glob(f"*{_SUFFIX}") if x.is_file() and not x.is_symlink()]
+            for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
+                path.unlink()
+            files.remove_unfinished(self.path)
 
     def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
-        """Finds a cached program, or traces and caches a new one.
+        """Finds a cached program, or traces and caches it.
 
         Args:
           name: of the program.
@@ -126,16 +92,25 @@ class Kept:
           The program; None if it cannot be exported. A line to standard error says why it cannot be
           loaded, exported or cached.
         """
-        found = self.find(name, args)
-        if found is not None:
-            return found
-        # A run must not end because the next one will be slower: where a program calls something
-        # that JAX cannot export, or on a full disk.
-        traced = None
+        shapes = repr(shapes_of(args)).encode()
+        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
+        path, traced = self.path / f"{name}-{digest}.stablehlo", None
+        # A run must not end because this one or the next will be slower: a damaged file, a program
+        # that calls something which JAX cannot export, a full disk.
+        try:
+            # A single wrong bit could end the process.
+            structure, flat = pickle.loads(files.without_digest(path.read_bytes()))
+            traced = Traced(export.deserialize(bytearray(flat)), structure)
+            path.touch()
+            return traced
+        except FileNotFoundError:
+            pass
+        except Exception as error:
+            self._tell(error)
         try:
             traced = trace(function, args)
             content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
-            files.write_digested(self._file(name, args), content, mode=0o600)
+            files.write_digested(path, content, mode=0o600)
         except Exception as error:
             self._tell(error)
         return traced
@@ -146,19 +121,9 @@ class Kept:
         reason = f"{type(error).__name__} {text}".splitlines()[0]
         self._complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
 
-    def _file(self, name: str, args: PyTree) -> Path:
-        """The file of a program."""
-        shapes = repr(shapes_of(args)).encode()
-        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
-        return self.path / f"{name}-{digest}.stablehlo"
-
 
 def trace(function: Function, args: PyTree) -> Traced:
     """Traces a program and lowers it, apart from whatever calls it.
-
-    Args:
-      function: what to trace.
-      args: its arguments or their shapes.
 
     Raises:
       NotImplementedError: if it calls something that JAX cannot export, such as the host.
@@ -206,29 +171,20 @@ def _make_private(path: Path) -> None:
     with contextlib.suppress(FileExistsError):
         path.mkdir(mode=0o700, parents=True)
     found = path.lstat()
-    if not (stat.S_ISDIR(found.st_mode) and _is_private(found, 0o077)):
-        raise PermissionError(f"{path} must be a directory that you own, with mode 0700")
-
-
-def _is_private(found: os.stat_result, others: int) -> bool:
-    """Whether this user owns a file, and other users have none of the rights `others`."""
     is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
-    return is_own and found.st_mode & others == 0
+    if not (stat.S_ISDIR(found.st_mode) and is_own and not found.st_mode & 0o077):
+        raise PermissionError(f"{path} must be a directory that you own, with mode 0700")
 
 
 def _surroundings() -> list[object]:
     """Code, versions, options and devices, on which tracing depends."""
-    variables = [item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_"))]
+    variables = [(n, x) for n, x in os.environ.items() if n.startswith(("JAX_", "XLA_"))]
+    options = [*variables, *((name, str(x)) for name, x in jax.config.values.items())]
     return [
         version.SOURCE,
         version.versions(),
-        sorted((name, value) for name, value in variables if not _sets_cache(name)),
-        sorted((name, str(x)) for name, x in jax.config.values.items() if not _sets_cache(name)),
+        # Where compiled programs are cached leaves them unchanged.
+        sorted((name, x) for name, x in options if "cache" not in name.lower()),
         jax.devices()[0].client.platform_version,
         [(device.platform, device.device_kind) for device in jax.devices()],
     ]
-
-
-def _sets_cache(option: str) -> bool:
-    """Whether an option only concerns JAX's cache and leaves programs unchanged."""
-    return "cache" in option.lower()

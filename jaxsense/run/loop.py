@@ -70,23 +70,18 @@ def train(
             raise
 
 
+@dataclasses.dataclass
 class _Loop:
     """One training."""
 
-    def __init__(
-        self,
-        key: Key,
-        config: Config,
-        programs: Programs,
-        monitor: Monitor,
-        checkpoints: Checkpoints,
-        saver: ThreadPoolExecutor,
-    ):
-        self._key, self._config = key, config
-        self._programs, self._monitor = programs, monitor
-        self._checkpoints, self._saver = checkpoints, saver
-        self._saving: list[Future[None]] = []
-        self._curves: dict[str, Curves] = {}
+    key: Key
+    config: Config
+    programs: Programs
+    monitor: Monitor
+    checkpoints: Checkpoints
+    saver: ThreadPoolExecutor
+    saving: list[Future[None]] = dataclasses.field(default_factory=list)
+    curves: dict[str, Curves] = dataclasses.field(default_factory=dict)
 
     def run(self) -> Trained:
         """Runs all stages."""
@@ -97,7 +92,7 @@ class _Loop:
                 begun[stage.name] = threads.submit(self._run_stage, stage, inputs)
                 return begun[stage.name]
 
-            stages.train(drive, self._config, self._programs.arena)
+            stages.train(drive, self.config, self.programs.arena)
             kept = {name: x for name, x in begun.items() if name not in _ONLY_PASSED_ON}
             left = set(begun.values())
             begun.clear()
@@ -107,14 +102,14 @@ class _Loop:
                 if done:
                     done.clear()  # lets go of outputs
                     devices.give_back_freed()
-        self._monitor.check_stop()
+        self.monitor.check_stop()
         outputs = {name: output.result() for name, output in kept.items()}
         self.wait_for_saving()
-        return Trained(outputs, self._curves)
+        return Trained(outputs, self.curves)
 
     def wait_for_saving(self) -> None:
         """Waits until all is saved, and raises the first error."""
-        for each in self._saving:
+        for each in self.saving:
             each.result()
 
     def _run_stage(self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]]) -> Output:
@@ -125,35 +120,35 @@ class _Loop:
             if found is not None:
                 return found
             given = jax.tree.map(lambda x: x.result() if isinstance(x, Future) else x, inputs)
-            self._monitor.check_stop()
+            self.monitor.check_stop()
             output = (self._train if stage.chunks else self._once)(stage, given)
             if not stage.is_optional:
-                self._monitor.check_finite(stage.name, "results", output)
+                self.monitor.check_finite(stage.name, "results", output)
             if is_saved:
                 self._save(stage, output)
             return output
         except Stopped:
             raise
         except Exception as error:
-            self._monitor.fail(error)
+            self.monitor.fail(error)
             raise
         finally:
-            self._programs.used(stage)
+            self.programs.used(stage)
 
     def _once(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage without steps."""
-        output = stage.finish(self._config, self._begin(stage, inputs), **inputs)
+        output = stage.finish(self.config, self._begin(stage, inputs), **inputs)
         # Joined rows lie on the host, and every program would transfer them again.
         return jax.device_put(output)
 
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The first state."""
-        return self._programs.of(stage).begin(stage.key(self._key), self._config, inputs)
+        return self.programs.of(stage).begin(stage.key(self.key), self.config, inputs)
 
     def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage with steps."""
-        programs, config = self._programs.of(stage), self._config
-        keys = stage.chunk_keys(self._key)
+        programs, config, failed = self.programs.of(stage), self.config, self._no_curves(stage)
+        keys = stage.chunk_keys(self.key)
         # The rate must not include compilation.
         programs.advance.wait()
 
@@ -161,26 +156,24 @@ class _Loop:
             begin = time.perf_counter()
             state, progress = programs.advance(keys[chunk], config, state, inputs)
             seconds = time.perf_counter() - begin
-            curves = self._report(stage, chunk, progress)
-            return state, {**curves, "seconds": [seconds]}
+            return state, {**self._report(stage, chunk, progress), "seconds": [seconds]}
 
         try:
             # Nobody but `run_chunks` holds the first state, so that it can let go of it.
-            state, curves = run_chunks(
+            state, self.curves[stage.name] = run_chunks(
                 stage,
                 self._begin(stage, inputs),
                 advance,
-                self._monitor,
-                self._checkpoints,
-                self._no_curves(stage),
+                self.monitor,
+                self.checkpoints,
+                failed,
             )
         except StageError as error:
             if not stage.is_optional:
                 raise
-            self._monitor.warn(f"{error}: left out")
-            self._curves[stage.name] = self._no_curves(stage)
-            return _failed(self._programs.of(stage).shapes.result().output)
-        self._curves[stage.name] = curves
+            self.monitor.warn(f"{error}: left out")
+            self.curves[stage.name] = failed
+            return _failed(programs.shapes.result().output)
         return programs.finish(config, state, inputs)
 
     def _report(self, stage: Stage, chunk: int, progress: Progress) -> Curves:
@@ -195,40 +188,40 @@ class _Loop:
             for name, values in metrics.items()
             if np.isfinite(values).any()
         }
-        self._monitor.report(stage.name, done, stage.steps, losses, **means)
+        self.monitor.report(stage.name, done, stage.steps, losses, **means)
         return {name: values.tolist() for name, values in metrics.items()}
 
     def _load(self, stage: Stage) -> Output:
         """The saved output of a finished stage; None if there is none."""
         if stage.chunks:
             shapes = _as_arrays(self._no_curves(stage))
-            curves = self._checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
+            curves = self.checkpoints.load_or_forget(f"curves_{stage.name}", shapes)
             if curves is None:
                 return None
-            self._curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
-        output = self._programs.of(stage).shapes.result().output
-        return self._checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
+            self.curves[stage.name] = {name: x.tolist() for name, x in curves.items()}
+        output = self.programs.of(stage).shapes.result().output
+        return self.checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a failed training."""
-        metrics = self._programs.of(stage).shapes.result().metrics
+        metrics = self.programs.of(stage).shapes.result().metrics
         return {**dict.fromkeys(metrics, [np.nan] * stage.steps), "seconds": [0.0] * stage.chunks}
 
     def _save(self, stage: Stage, output: Output) -> None:
         """Saves a finished stage while others run; raises if an earlier save failed."""
-        for each in self._saving:
+        for each in self.saving:
             if each.done():
                 each.result()
-        if self._checkpoints.path is None:
+        if self.checkpoints.path is None:
             return
 
         def save() -> None:
             if stage.chunks:
-                curves = _as_arrays(self._curves[stage.name])
-                self._checkpoints.save(f"curves_{stage.name}", curves)
-            self._checkpoints.save(stage.name, output)
+                curves = _as_arrays(self.curves[stage.name])
+                self.checkpoints.save(f"curves_{stage.name}", curves)
+            self.checkpoints.save(stage.name, output)
 
-        self._saving.append(self._saver.submit(save))
+        self.saving.append(self.saver.submit(save))
 
 
 def _as_arrays(curves: Curves) -> dict[str, np.ndarray]:
@@ -252,21 +245,20 @@ def run_chunks(
     checkpoints: Checkpoints,
     whole: Curves | None = None,
 ) -> tuple[Output, Curves]:
-    """Runs a training from where it was last saved.
+    """Runs a training from where it was last saved; saves it once a minute, and when it stops.
 
     Args:
       stage: with chunks.
       state: first state.
       run: `(chunk, state) -> (state, metrics)`, deterministic.
       monitor: asked whether to stop.
-      checkpoints: where to save the training once a minute, and when it stops.
+      checkpoints: where to save the training.
       whole: see `Checkpoints.load_unfinished`.
 
     Returns:
       The last state and the metrics of all chunks.
 
     Raises:
-      Stopped: if the run must stop before the training ends; it is saved.
       StageError: from `run`; the state before the chunk is saved.
     """
     done, curves = 0, Curves()

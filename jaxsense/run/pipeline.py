@@ -76,15 +76,9 @@ def compiled(
     trainings: int = 0,
     policies: OwnPolicies | None = None,
 ) -> Iterator[Programs]:
-    """The programs of runs with the same settings, compiled in the background.
+    """The programs of runs with the same settings, compiled in the background; see `Programs`.
 
-    Args:
-      config: all settings.
-      monitor: receives the time that it takes.
-      workers: share scenes and missions.
-      kept: where to keep compiled programs for later runs, if anywhere.
-      trainings: see `Programs`.
-      policies: custom policies by name; keep no programs with these, whose code may change.
+    Keep no programs with custom policies, whose code may change.
 
     Raises:
       ConfigError: see `mission.require_playable`.
@@ -101,24 +95,15 @@ def learn(
     monitor: Monitor,
     checkpoints: Checkpoints | None = None,
 ) -> Learned:
-    """Trains everything and summarises it.
-
-    Args:
-      key: the only source of randomness.
-      config: all settings.
-      programs: from `compiled`, with the same monitor.
-      monitor: receives time and progress.
-      checkpoints: see `loop.train`.
-
-    Raises:
-      StageError, Stopped, OSError: see `loop.train`.
-    """
+    """Trains everything and summarises it; see `loop.train`."""
     trained = train(key, config, programs, monitor, checkpoints)
     scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
     beliefs = summary.beliefs(trained.outputs["beliefs"])
     is_sound = compare.unsound(beliefs) is None
+    # Measured of a JMVAE that learns from scans, and of no other.
+    grouped = {name: x for name, x in trained.outputs.items() if name == "grouped"}
     return Learned(
         models=models(trained.outputs, config),
         windows={
@@ -138,7 +123,7 @@ def learn(
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": summary.jmvae(vars(latent) | _grouped(trained)),
+            "jmvae": summary.jmvae(vars(latent) | grouped),
             "belief": beliefs,
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
         },
@@ -149,19 +134,10 @@ def play(
     key: Key,
     config: Config,
     programs: Programs,
-    monitor: Monitor,
     learned: Learned,
     checkpoints: Checkpoints | None = None,
 ) -> Played:
-    """Plays the missions of a run and summarises them.
-
-    Args:
-      key: as in `learn`.
-      config: as in `learn`.
-      programs: as in `learn`.
-      monitor: as in `learn`.
-      learned: from `learn`.
-      checkpoints: as in `learn`; forgets unfinished trainings.
+    """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 
     Raises:
       StageError, Stopped: see `missions.Player.play`.
@@ -173,12 +149,6 @@ def play(
     (checkpoints or Checkpoints()).forget_unfinished(stage.name for stage in programs.stages)
     block = summary.missions(player.mission, found.metrics)
     return Played(found.recording, found.naive, block)
-
-
-def _grouped(trained: Trained) -> dict[str, object]:
-    """What is measured of a JMVAE that learns from scans, and of no other."""
-    found = trained.outputs.get("grouped")
-    return {} if found is None else {"grouped": found}
 
 
 def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:

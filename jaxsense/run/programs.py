@@ -44,14 +44,7 @@ class Shapes(NamedTuple):
 
 
 class StagePrograms:
-    """The programs of a stage.
-
-    Attributes:
-      begin: `(key, config, inputs) -> state`.
-      advance: `(key, config, state, inputs) -> (state, Progress)`.
-      finish: `(config, state, inputs) -> output`, of a stage with steps.
-      shapes: known once the programs are traced.
-    """
+    """The programs of a stage, see `Stage`; `shapes` are known once they are traced."""
 
     def __init__(self, compiler: Compiler, name: str):
         self._all = [Program(compiler, name, part) for part in ("begin", "advance", "finish")]
@@ -72,14 +65,7 @@ class StagePrograms:
 
 
 class Programs:
-    """Compiled programs of runs whose settings differ only in their leaves.
-
-    Attributes:
-      config: all settings.
-      arena: of the simulation.
-      stages: of the training.
-      player: of the missions.
-    """
+    """Compiled programs of runs whose settings differ only in their leaves."""
 
     def __init__(
         self,
@@ -151,11 +137,7 @@ class Programs:
         self.player.set_result(player)
 
     def _compile(self, stage: Stage, inputs: dict[str, Output]) -> Output:
-        """Compiles the programs of a stage, unless an earlier stage shares them.
-
-        Returns:
-          The shapes of its output.
-        """
+        """Shapes of a stage's output; compiles its programs unless an earlier stage shares them."""
         compiled, key, config = self.of(stage), jax.random.key(0), self.config
         if compiled.shapes.done():
             return compiled.shapes.result().output

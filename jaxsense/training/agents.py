@@ -42,14 +42,7 @@ State = dqn.DqnState[Output]
 def look_values(
     key: Key, config: Config, *, classes: Belief, detections: Detections
 ) -> tuple[LookValues, ...]:
-    """Values of looks with each modality, from features for training.
-
-    Args:
-      key: not used.
-      config: all settings.
-      classes: `[C, D]` mean joint posterior of each class.
-      detections: of all sensors.
-    """
+    """Values of looks with each modality, from features for training."""
     del key
     settings, bayes = config.evaluation, make_bayes(config)
     reward, prior = rewards.make(config.mdp), make_prior(config)
@@ -99,20 +92,7 @@ def train(
     fusion: Output,
     detectors: tuple[Output, ...],
 ) -> dict[str, Output]:
-    """Trains each learner's Q-network, and the network that orders looks, if any does.
-
-    Args:
-      drive: executes stages.
-      config: all settings.
-      arena: of live looks.
-      look_values: values of looks with each modality.
-      detections: of all sensors.
-      fusion: how looks update the map.
-      detectors: of each modality.
-
-    Returns:
-      The Q-networks by `learner`.
-    """
+    """Trains the Q-networks, returned by `learner`, and the network that orders looks, if any."""
     given = {"detections": detections, "fusion": fusion, "detectors": detectors}
     starts = drive(Stage("starts", functools.partial(_starts, arena)), **given)
     networks: dict[str, Output] = {}

@@ -72,15 +72,7 @@ def held_out_mdp(
 def learned_return(
     key: Key, modality: Int[Array, ""], q_network: Params, mdp: MapMdp, config: Config
 ) -> Float[Array, ""]:
-    """Mean total reward of a Q-network's policy, in one episode from each of random starts.
-
-    Args:
-      key: random key.
-      modality: `[]` int32 index of the agent's own sensor.
-      q_network: parameters of the Q-network.
-      mdp: from `held_out_mdp`.
-      config: all settings.
-    """
+    """Mean total reward of a Q-network's policy, in one episode from each of random starts."""
     agent, exact = make_agent(config), make_bayes(config)
 
     def act(key: Key, known: Known) -> jax.Array:
@@ -109,8 +101,8 @@ def compare_policies(
 
     Args:
       key: random key.
-      modality: `[]` int32 index of the agent's own sensor.
-      models: trained models, in whose `q_networks` all are of this modality.
+      modality: index of the agent's own sensor.
+      models: whose `q_networks` are all of this modality.
       mdp: from `held_out_mdp`.
       config: all settings.
       own: custom policies by name.
@@ -166,10 +158,7 @@ def _in_groups(
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
     """Plays episodes on a CPU group by group, so that short ones need not wait for long ones.
 
-    Args:
-      play: rewards of a number of episodes, of which all run until the longest has ended.
-      looks: of the own sensor before each; the more, the shorter is the episode.
-      starts: `[S, ...]` arguments of `play`.
+    The more looks of the own sensor came before, the shorter is the episode.
     """
     number = len(looks) // _LEAST_GROUP if jax.default_backend() == "cpu" else 1
     if number <= 1:
@@ -219,18 +208,7 @@ def play_policies(
     detections: Detections,
     num_pois: int | None = None,
 ) -> Rewards:
-    """Runs `compare_policies` for one modality.
-
-    Args:
-      key: random key.
-      config: all settings.
-      modality: `[]` int32 index of the agent's own sensor.
-      q_network: parameters of the Q-network.
-      fusion: how looks update the map.
-      look_values: for each modality, the values of looks.
-      detections: of all sensors.
-      num_pois: N; as in the arena by default.
-    """
+    """Runs `compare_policies` for one modality; with as many PoIs as in the arena by default."""
     q_networks = (q_network,) * len(config.modalities)
     models = models_of(config, fusion, look_values, q_networks)
     mdp = held_out_mdp(config, fusion, detections, num_pois)
@@ -238,13 +216,7 @@ def play_policies(
 
 
 def play_numbers(key: Key, config: Config, **inputs: Output) -> list[Rewards]:
-    """Runs `compare_policies` with each number of PoIs in `evaluation.num_pois`.
-
-    Args:
-      key: random key.
-      config: all settings.
-      **inputs: see `play_policies`.
-    """
+    """Runs `play_policies` with each number of PoIs in `evaluation.num_pois`."""
     settings = config.evaluation
     fewer = dataclasses.replace(settings, num_states=1, num_repeats=-(-settings.num_repeats // 8))
     there = dataclasses.replace(config, evaluation=fewer)

@@ -25,9 +25,9 @@ class Repeated:
     """Scenes at whose first PoIs a sensor looks again and again.
 
     Attributes:
-      classes: `[S, N]` int32 classes of the PoIs in the simulation.
-      places: `[S]` random keys of the PoIs' places, see `looks.repeats`; None for any.
-      taken_for: `[S]` int32 class to learn that the first PoI shows.
+      classes: of the PoIs in the simulation.
+      places: `[S]` keys, see `looks.repeats`; None for any.
+      taken_for: class to learn that the first PoI shows.
     """
 
     classes: Int[Array, "S N"]
@@ -45,12 +45,9 @@ def random_scenes(key: Key, config: Config) -> Repeated:
 def novelty_stage(
     arena: Arena, config: Config, scenes: Callable[..., Repeated] = random_scenes
 ) -> Stage:
-    """Makes the stage that learns how much of a look is new; all of it if there are no such scenes.
+    """Makes the stage that learns how much of a look is new; all of it without such scenes.
 
-    Args:
-      arena: of the simulation.
-      config: all settings.
-      scenes: `(key, config, **inputs) -> Repeated`, with `detector.num_repeats` scenes.
+    `scenes(key, config, **inputs)` draws `detector.num_repeats` of them.
     """
     number = config.detector.num_repeats
 

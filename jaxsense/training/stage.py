@@ -110,7 +110,7 @@ def fit_stage(
 
     Args:
       name: of the stage.
-      settings: of the fit; only the number of steps matters.
+      settings: only the number of steps matters.
       untrained: `(key, config, **inputs) -> (model, parameters to fit)`.
       problem: `(config, model, **inputs) -> Problem`.
       trained: `(config, model, FitState, **inputs) -> output`.

@@ -120,12 +120,7 @@ def _learn_from_scans(
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
-    """The stages of a training, in the order of `train`.
-
-    Args:
-      config: all settings.
-      arena: as in `learn`.
-    """
+    """The stages of a training, in the order of `train`."""
     found: list[Stage] = []
     train(lambda stage, **_: found.append(stage), config, _arena(config, arena))
     return found
@@ -146,10 +141,6 @@ def learn(
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
       arena: from `sim.make_world(config)`; compiled anew by default.
       until: name of the last stage; all stages by default.
-
-    Returns:
-      The outputs of the stages: the trained networks, see `models`, and all measurements of a run
-      except its missions.
 
     Raises:
       ValueError: if `config` is no `Config`, or no stage has this name.
@@ -182,12 +173,7 @@ def _arena(config: Config, arena: Arena | None) -> Arena:
 
 
 def models(outputs: Mapping[str, Output], config: Config) -> Models:
-    """Collects the models from the outputs of all stages.
-
-    Args:
-      outputs: by the name of the stage.
-      config: all settings.
-    """
+    """Collects the models from the outputs of all stages, by name."""
     return make_models(
         config,
         detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
