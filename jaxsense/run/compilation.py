@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxsense.run import devices
-from jaxsense.run.devices import ALONE, Row, Workers
+from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.kept import Function, Kept, Traced, shapes_of, trace
 from jaxsense.run.monitor import Monitor
 
@@ -103,7 +103,7 @@ class Program:
         if number == 1:
             return args
 
-        def pad(x: Row) -> Row:
+        def pad(x: jax.Array | jax.ShapeDtypeStruct) -> jax.Array | jax.ShapeDtypeStruct:
             given = x.shape[0]
             if not (missing := -given % number):
                 return x

@@ -98,6 +98,10 @@ def scan(
     return stage.finish(config, state, **inputs), progress
 
 
+_Fit = tuple[Output, FitState]
+"""An untrained model, and the state of its fit."""
+
+
 def fit_stage(
     name: str,
     settings: FitConfig,
@@ -116,18 +120,17 @@ def fit_stage(
       trained: `(config, model, FitState, **inputs) -> output`.
     """
     size, chunks = in_chunks(settings.steps)
-    State = tuple[Output, FitState]
 
-    def begin(key: Key, config: Config, **inputs: Output) -> State:
+    def begin(key: Key, config: Config, **inputs: Output) -> _Fit:
         model, params = untrained(key, config, **inputs)
         return model, supervised.start(params, settings)
 
-    def advance(key: Key, config: Config, state: State, **inputs: Output) -> tuple[State, Progress]:
+    def advance(key: Key, config: Config, state: _Fit, **inputs: Output) -> tuple[_Fit, Progress]:
         model, fit = state
         fit, losses = supervised.fit(key, fit, problem(config, model, **inputs), size)
         return (model, fit), Progress(losses, {})
 
-    def finish(config: Config, state: State, **inputs: Output) -> Output:
+    def finish(config: Config, state: _Fit, **inputs: Output) -> Output:
         return trained(config, *state, **inputs)
 
     return Stage(name, begin, advance, finish, settings.steps, chunks)
