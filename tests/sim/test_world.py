@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxsense.looks
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Config, ConfigError, ViewpointConfig
 from jaxsense.sim import viewpoints, world
@@ -99,6 +98,48 @@ def test_hand_worked_room_around_a_viewpoint():
     assert room(-0.4, 0.0, far, poi=1) < 0
 
 
+POSITIONS = jnp.array([[0.0, 0.0], [1.2, 1.2], [-1.2, 1.2]])
+PLACE = jnp.array([0.6, 0.0])
+
+
+@pytest.fixture(scope="module")
+def moved():
+    layout = sim.make_layout(ArenaConfig(), POSITIONS, np.zeros(3), np.zeros(3, np.int32))
+
+    @jax.jit
+    def draw(keys, distance, others):
+        return jax.vmap(
+            lambda key: viewpoints.moved_viewpoint(
+                key, ViewpointConfig(), ArenaConfig(), layout, others, jnp.int32(0), PLACE, distance
+            )
+        )(keys)
+
+    keys = jax.random.split(jax.random.key(0), 64)
+    return lambda distance, others: draw(keys, jnp.float32(distance), jnp.array(others))
+
+
+def test_second_viewpoints_are_at_the_distance_in_range_and_face_the_poi(moved):
+    poses, believed = moved(0.4, [[1.4, -1.4]])
+    np.testing.assert_allclose(np.hypot(*(poses[:, :2] - PLACE[None]).T), 0.4, rtol=1e-5)
+    to_poi = np.hypot(*poses[:, :2].T)
+    assert np.all((to_poi >= 0.3) & (to_poi <= 1.2))
+    assert np.ptp(np.arctan2(poses[:, 1], poses[:, 0] - 0.6)) > 1
+    found = jax.vmap(lambda pose: viewpoints.bearing(pose, POSITIONS[0]))(poses)
+    assert np.all(np.abs(found) <= np.radians(20) + 1e-5)
+    # The robot knows the bearing to one degree.
+    assert 0 < np.abs(found - believed).max() <= np.radians(1) + 1e-5
+
+
+def test_where_no_place_is_free_at_that_distance_the_robot_stays(moved):
+    # 2 m from there, nothing is within 1.2 m of the PoI.
+    poses, _ = moved(2.0, [[1.4, -1.4]])
+    np.testing.assert_array_equal(poses[:, :2], np.broadcast_to(PLACE, (64, 2)))
+    # Another robot stands where it would go.
+    ring = [[0.6 + 0.1 * np.cos(a), 0.1 * np.sin(a)] for a in np.linspace(0, 6, 8)]
+    poses, _ = moved(0.1, ring)
+    np.testing.assert_array_equal(poses[:, :2], np.broadcast_to(PLACE, (64, 2)))
+
+
 @pytest.fixture(scope="module")
 def simulation():
     return sim.make_world(Config())
@@ -147,19 +188,6 @@ def test_look_is_centred_on_the_poi(looks):
     depth = distance - np.median(ranges[:, 62:66], axis=-1)
     assert depth.min() > 0.1 - 0.03
     assert depth.max() < 0.1415 + 0.03
-
-
-@pytest.mark.slow
-def test_surveys_equal_single_ones(simulation, monkeypatch):
-    monkeypatch.setattr(jaxsense.looks, "_SCENES_AT_ONCE", 2)  # of five
-    keys = jax.random.split(jax.random.key(0), 5)
-    classes = jnp.tile(CLASSES, (5, 1))
-    surveys = jax.jit(lambda k, c: jaxsense.looks.surveys(k, simulation, c))
-    single = jax.jit(lambda k, c: world.survey(k, simulation, c))
-    together = jax.device_get(surveys(keys, classes))
-    for i in range(5):
-        alone = single(keys[i], classes[i])
-        chex.assert_trees_all_close(jax.tree.map(lambda x: x[i], together), alone, atol=1e-5)  # noqa: B023
 
 
 def test_the_world_of_other_settings_keeps_the_arena():
