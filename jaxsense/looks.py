@@ -34,12 +34,7 @@ _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 @pytree
 class Live:
-    """Simulates every look, with one MJX arena for each environment.
-
-    Attributes:
-      world: the simulation.
-      detectors: one for each modality.
-    """
+    """Simulates every look, with one MJX arena for each environment."""
 
     world: World
     detectors: tuple[Detector, ...]
@@ -50,38 +45,20 @@ class Live:
         return len(self.detectors)
 
     def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
-        """Random scene with PoIs of the given classes.
-
-        Args:
-          key: random key.
-          classes: `[N]` int32.
-        """
+        """Random scene with PoIs of `[N]` int32 classes."""
         return worlds.random_scene(key, self.world, classes)
 
     def observe(
         self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
     ) -> tuple[Float[Array, " D_m"], Scene]:
-        """Puts a robot at a random viewpoint of a PoI and scans, see `Looks.observe`.
-
-        Args:
-          key: random key.
-          scene: the current scene.
-          poi: `[]` int32.
-          modality: index of the sensor; static.
-        """
-        (window, _), scene = worlds.look(key, self.world, scene, modality, poi)
-        return detectors.detect(self.detectors[modality], window), scene
+        """Puts a robot at a random viewpoint of a PoI and scans, see `Looks.observe`."""
+        look, scene = worlds.look(key, self.world, scene, modality, poi)
+        return detectors.features(self.detectors[modality], *look), scene
 
 
 @pytree
 class Bank:
-    """Draws looks from stored features, without simulation.
-
-    A scene holds only the classes of the PoIs.
-
-    Attributes:
-      features: for each modality `[C, S, D_m]`, S looks at every class.
-    """
+    """Draws looks from stored features; a scene holds only the classes of the PoIs."""
 
     features: Samples
 
@@ -91,21 +68,14 @@ class Bank:
         return len(self.features)
 
     def scene(self, key: Key, classes: Int[Array, " N"]) -> Int[Array, " N"]:
-        """Returns the `[N]` int32 `classes`; the `key` is not used."""
+        """The classes."""
         del key
         return classes
 
     def observe(
         self, key: Key, scene: Int[Array, " N"], poi: Int[Array, ""], modality: int
     ) -> tuple[Float[Array, " D_m"], Int[Array, " N"]]:
-        """Draws a look at the PoI's class, see `Looks.observe`.
-
-        Args:
-          key: random key.
-          scene: `[N]` int32 classes.
-          poi: `[]` int32.
-          modality: index of the sensor; static.
-        """
+        """Draws a look at the PoI's class, see `Looks.observe`."""
         samples = self.features[modality]
         # A key from a split is as random as a draw from it.
         row = jax.random.key_data(key)[-1] % samples.shape[1]
@@ -155,7 +125,7 @@ def _require_fitting(config: Config, models: Models, looks: Looks) -> None:
     if isinstance(looks, Live):
         checks.require_one_each("detectors", looks.detectors, config.modalities)
         for sensor, detector in zip(looks.world.sensors, looks.detectors, strict=True):
-            size, found = sensor.window * sensor.channels, len(detector.gate.offset)
+            size, found = sensor.window * sensor.channels, detector.window_size
             if found != size:
                 reason = f"reads windows of {found} numbers; must be of {size}, as config's are"
                 raise ValueError(f"models.detectors of {sensor.name}: {reason}")
@@ -185,14 +155,6 @@ def surveys(
 ) -> tuple[Scene, tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
     """Surveys many scenes, see `sim.survey`.
 
-    Args:
-      keys: `[S]` random keys.
-      world: the simulation.
-      classes: `[S, N]` int32 classes of the PoIs.
-      is_empty: `[S]` bool, in which scenes no look shows its PoI; in none by default.
-      places: `[S]` random keys, scenes with the same of which show the same PoIs in another light;
-        different ones by default.
-
     Returns:
       `[S]` scenes, for each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
     """
@@ -215,68 +177,43 @@ def repeats(
     modality: int,
     number: int,
     places: Key | None = None,
-) -> tuple[Float[Array, "S {number} F"], Float[Array, "S {number} 2"]]:
-    """Looks several times at the first PoI of many scenes, from near the first look.
+) -> tuple[Float[Array, "S T F"], Float[Array, "S T"], Float[Array, "S T 2"]]:
+    """Looks T times at the first PoI of many scenes, from near the first look.
 
     In half of the scenes all looks are from one place, in the others up to 1 m away from it.
 
-    Args:
-      keys: `[S]` random keys.
-      world: the simulation.
-      classes: `[S, N]` int32 classes of the PoIs.
-      modality: index of the sensor; static.
-      number: T, looks in each scene; static.
-      places: `[S]` random keys of the PoIs' places, see `surveys`; different ones by default.
-
     Returns:
-      `[S, T, F]` windows, and `[S, T, 2]` positions of the looks, in metres.
+      Windows, expected distances, and positions of the robot.
     """
 
-    def look(scene: tuple[Key, jax.Array, Key | None]) -> tuple[jax.Array, jax.Array]:
+    def look(scene: tuple[Key, jax.Array, Key | None]) -> tuple[jax.Array, jax.Array, jax.Array]:
         key, classes, places = scene
         scene_key, move_key, first_key, *later_keys = jax.random.split(key, 2 + number)
         farthest = jnp.where(jax.random.bernoulli(move_key), _FARTHEST_MOVE, 0.0)
         drawn, poi = worlds.random_scene(scene_key, world, classes, places), jnp.int32(0)
-        (first, _), seen = worlds.look(first_key, world, drawn, modality, poi)
+        first, seen = worlds.look(first_key, world, drawn, modality, poi)
         again = jax.vmap(lambda key: worlds.look_again(key, world, seen, modality, poi, farthest))
-        windows, _, positions = again(jnp.stack(later_keys))
-        place = seen.poses[modality, :2]
-        return (
-            jnp.concatenate([first[None], windows]),
-            jnp.concatenate([place[None], positions]),
-        )
+        first = (*first, seen.poses[modality, :2])
+        later = again(jnp.stack(later_keys))
+        return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, later)
 
     batch = min(_SCENES_AT_ONCE, len(keys))
     return jax.lax.map(look, (keys, classes, places), batch_size=batch)
 
 
-def detect_all(
-    trained: tuple[Detector, ...], windows: tuple[Float[Array, "S N _"], ...]
-) -> tuple[Float[Array, "S N _"], ...]:
-    """Features of surveyed scenes.
-
-    Args:
-      trained: one detector for each modality.
-      windows: for each modality `[S, N, F]`.
-
-    Returns:
-      For each modality `[S, N, D_m]`.
-    """
-    detect = jax.vmap(jax.vmap(detectors.detect, (None, 0)), (None, 0))
-    return tuple(detect(d, w) for d, w in zip(trained, windows, strict=True))
+def features(
+    trained: tuple[Detector, ...],
+    windows: tuple[Float[Array, "S N _"], ...],
+    distances: Float[Array, "S M N"],
+) -> tuple[Float[Array, "S N D_m"], ...]:
+    """Features of surveyed scenes, for each modality."""
+    of_looks = jax.vmap(jax.vmap(detectors.features, (None, 0, 0)), (None, 0, 0))
+    each = zip(trained, windows, jnp.swapaxes(distances, 0, 1), strict=True)
+    return tuple(of_looks(*given) for given in each)
 
 
 def balanced_classes(key: Key, config: Config, number: int) -> Int[Array, "{number} N"]:
-    """Draws classes for scenes, in random order and equally frequent up to a remainder.
-
-    Args:
-      key: random key.
-      config: all settings.
-      number: of scenes; static.
-
-    Returns:
-      `[number, N]` int32.
-    """
+    """Classes for a number of scenes, in random order and equally frequent up to a remainder."""
     num_pois = config.arena.num_pois
     even = jnp.arange(number * num_pois) % len(config.arena.classes)
     return jax.random.permutation(key, even).reshape(number, num_pois)
@@ -285,16 +222,9 @@ def balanced_classes(key: Key, config: Config, number: int) -> Int[Array, "{numb
 def by_class(
     values: Shaped[Array, "S N *F"], classes: Int[Array, "S N"], num_classes: int, number: int
 ) -> Shaped[Array, "{num_classes} {number} *F"]:
-    """Sorts looks by class.
+    """Sorts looks by class; those of a class with fewer than `number` are taken again.
 
-    Args:
-      values: `[S, N, ...]`, of which looks are taken again where a class has fewer than `number`.
-      classes: `[S, N]` int32, among which each class must occur.
-      num_classes: C; static.
-      number: looks to keep at each class; static.
-
-    Returns:
-      `[C, number, ...]`.
+    Each class must occur.
     """
     flat, classes = values.reshape(-1, *values.shape[2:]), classes.reshape(-1)
 
@@ -307,16 +237,13 @@ def by_class(
 
 
 def detections(key: Key, config: Config, models: Models, samples: int) -> Samples:
-    """Simulates looks at every class and returns their features, for a `Bank`.
+    """Features of simulated looks at every class, for a `Bank`.
 
     Args:
       key: random key.
       config: all settings.
       models: whose detectors to use.
       samples: S, looks at each class by each sensor.
-
-    Returns:
-      For each modality `[C, S, D_m]`.
 
     Raises:
       ValueError: if `samples` is not positive, or looks lie outside the detectors' domains.
@@ -332,8 +259,8 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     def look(key: Key, world: World, models: Models) -> Samples:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
-        _, seen, _ = surveys(jax.random.split(survey_key, number), world, classes)
-        features = detect_all(models.detectors, seen)
-        return tuple(by_class(x, classes, num_classes, samples) for x in features)
+        _, seen, distances = surveys(jax.random.split(survey_key, number), world, classes)
+        found = features(models.detectors, seen, distances)
+        return tuple(by_class(x, classes, num_classes, samples) for x in found)
 
     return look(key, world, models)

@@ -21,20 +21,9 @@ from jaxsense.sim import search as searching
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.domain import Domain, make_domain
 from jaxsense.sim.sensors import Sensor
-from jaxsense.vae import (
-    detectors,
-    filter,
-    frames,
-    fusion,
-    gate,
-    jmvae,
-    latent,
-    leave_one_out,
-    novelty,
-    readout,
-)
+from jaxsense.vae import detectors, filter, frames, fusion, jmvae, leave_one_out, novelty, readout
 from jaxsense.vae.bayes import Bayes
-from jaxsense.vae.detectors import Detection, Detector
+from jaxsense.vae.detectors import Classifier, Detection, Detector
 from jaxsense.vae.frames import Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.leave_one_out import Encoder, Shape
@@ -84,10 +73,9 @@ class Models:
     ) -> Detection:
         """What a look says, from a whole scan.
 
-        It says that nothing is there if the window shows no PoI. It is not known what is there if
-        distance, bearing or sensor are not as the detector has learned them, see `sim.Domain`, or
-        if a reading of the window is negative, NaN or a brightness above 1. A distance that is
-        infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
+        Unknown if distance, bearing or sensor are not as the detector has learned them, see
+        `sim.Domain`, or if a reading of the window is negative, NaN or a brightness above 1. A
+        distance that is infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
 
         Args:
           modality: index of the sensor; static.
@@ -117,16 +105,10 @@ class Models:
         distance: Float[Array, ""],
         search: SearchConfig = _NO_SEARCH,
     ) -> Detection:
-        """What a look says, from the rays that the detector reads, see `detect`.
+        """What a look says, from the rays that the detector reads; otherwise as `detect`.
 
-        Args:
-          modality: index of the sensor; static.
-          sensor: the sensor.
-          readings: `[window, ...]` of the rays around the PoI's bearing; with a search, of those of
-            `sim.search.widened`.
-          bearing: of the PoI, see `detect`.
-          distance: of the PoI, see `detect`.
-          search: see `detect`.
+        `readings` are `[window, ...]`, around the PoI's bearing; with a search, those of
+        `sim.search.widened`.
         """
         wide, bearing = searching.widened(sensor, search), windows.wrapped(bearing)
         window = windows.as_window(wide, jnp.where(sensor.is_valid(readings), readings, jnp.nan))
@@ -134,27 +116,18 @@ class Models:
         # What has not been learned is expected nowhere.
         expected = jnp.where(domain.contains(sensor, bearing, distance), distance, jnp.nan)
         if not search.applies:
-            return detectors.answer(detector, window, expected)
+            return detectors.detect(detector, window, expected)
         tried = searching.candidates(sensor, search, window, bearing, expected)
         return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
         """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""
-        return latent.plausible_classes(belief, self.fusion.classes.mean)
+        return readout.plausible_classes(belief, self.fusion.classes.mean)
 
 
 @checks.typed
 def require_fitting(config: Config, models: Models) -> None:
-    """Checks that models can be those of some settings.
-
-    Args:
-      config: all settings.
-      models: the models.
-
-    Raises:
-      ValueError: if one is of another type, they are for other classes, or their fusion is no
-        `Fusion`.
-    """
+    """Raises `ValueError` if models are for other classes, or their fusion is no `Fusion`."""
     checks.require_members("models.fusion", models.fusion, Fusion)
     if jax.tree_util.all_leaves([models.fusion]):
         kind = type(models.fusion).__name__
@@ -170,7 +143,7 @@ def require_fitting(config: Config, models: Models) -> None:
 
 @checks.typed
 def make_jmvae(config: Config) -> Jmvae:
-    """Makes the shape of the JMVAE of a configuration: modalities and layer sizes."""
+    """The shape of the JMVAE of a configuration: modalities and layer sizes."""
     sizes = tuple(len(config.labels(m)) for m in config.modalities)
     return Jmvae(config.modalities, sizes, config.jmvae.latent_size, config.jmvae.hidden)
 
@@ -211,17 +184,12 @@ def make_prior(config: Config) -> Belief:
 
 @checks.typed
 def make_bayes(config: Config) -> Bayes:
-    """Makes the exact Bayes filter over the classes of a configuration."""
+    """The exact Bayes filter over the classes of a configuration."""
     return Bayes(jnp.array([config.label_of_class(m) for m in config.modalities]))
 
 
 def make_models(config: Config, **trained: Any) -> Models:
-    """Makes models of their trained parts; the others follow from the settings.
-
-    Args:
-      config: all settings.
-      **trained: the fields of `Models` but `domains`, `bayes` and `agent`.
-    """
+    """Models of their trained parts; `domains`, `bayes` and `agent` follow from the settings."""
     domains = tuple(make_domain(config, sensor) for sensor in sensors.make(config))
     return Models(domains=domains, bayes=make_bayes(config), agent=make_agent(config), **trained)
 
@@ -245,44 +213,85 @@ def make_agent(config: Config) -> Agent:
 
 
 def make_readout(config: Config, classes: Belief) -> Readout:
-    """Readout of class probabilities, see `vae.readout`.
-
-    Args:
-      config: all settings.
-      classes: `[C, D]` mean joint posterior of each class.
-    """
+    """Readout of class probabilities from `[C, D]` mean joint posteriors of the classes."""
     return readout.make(classes, readout.directions(make_jmvae(config).feature_sizes))
 
 
 @checks.typed
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
-    """Makes the paper's fusion in place, see `vae.InPlace`.
-
-    Args:
-      config: all settings.
-      params: of the JMVAE.
-      classes: `[C, D]` mean joint posterior of each class.
-    """
+    """The paper's fusion in place, see `vae.InPlace`."""
     model, read = make_jmvae(config), make_readout(config, classes)
     return fusion.InPlace(params, classes, make_prior(config), read, model)
 
 
-@checks.typed
-def init(key: Key, config: Config) -> Models:
-    """Initialises untrained models, to try functions before training.
+def make_detector(
+    key: Key, config: Config, modality: int, windows: Float[Array, "S F"]
+) -> Classifier:
+    """Untrained detector of a modality; its input is standardised by `windows` for training."""
+    num_labels = len(config.labels(config.modalities[modality]))
+    is_range = sensors.make(config)[modality].measures_distance
+    return detectors.init(key, windows, num_labels, config.detector, is_range)
+
+
+def make_encoder(
+    key: Key,
+    config: Config,
+    modality: int,
+    windows: Float[Array, "S F"],
+    params: Params,
+    scaling: Scaling,
+    classes: Belief,
+) -> Encoder:
+    """Encoder of a modality as a detector that has not learned yet where a PoI is.
 
     Args:
-      key: random key.
+      key: random key of the detector of presence.
       config: all settings.
+      modality: index of the sensor.
+      windows: for training, which standardise the input of the detector of presence.
+      params: of the JMVAE.
+      scaling: the frame in which the encoder sees windows.
+      classes: `[C, D]` mean joint posterior of each class.
     """
+    sensor = sensors.make(config)[modality]
+    return Encoder(
+        params=params["encoders"][sensor.name],
+        scaling=scaling,
+        presence=detectors.init(key, windows, 1, config.detector, sensor.measures_distance),
+        classes=classes,
+        readout=make_readout(config, classes),
+        prior=make_prior(config),
+        sharpness=jnp.float32(1.0),
+        shape=make_shape(config),
+        label_of_class=config.label_of_class(sensor.name),
+    )
+
+
+@checks.typed
+def init(key: Key, config: Config) -> Models:
+    """Untrained models, to try functions before training."""
     checks.require_key(key)
     detector_key, jmvae_key, dqn_key, filter_key, tours_key = jax.random.split(key, 5)
     model, agent = make_jmvae(config), make_agent(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = len(config.arena.classes), model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape))
-    learners = {"detections": _classifiers, "scans": _encoders}
-    untrained, params = learners[config.jmvae.learns_from](detector_key, jmvae_key, config, classes)
+    made, keys = sensors.make(config), jax.random.split(detector_key, len(config.modalities))
+    windows = [jnp.zeros((2, sensor.window * sensor.channels)) for sensor in made]
+    if config.jmvae.reads_scans:
+        shape = make_shape(config)
+        params = leave_one_out.init(jmvae_key, shape)
+        scalings = [
+            Scaling(make_frame(config, sensor), jnp.zeros(size), jnp.float32(1.0))
+            for sensor, size in zip(made, shape.inputs, strict=True)
+        ]
+        untrained = tuple(
+            make_encoder(k, config, m, windows[m], params, scalings[m], classes)
+            for m, k in enumerate(keys)
+        )
+    else:
+        params = jmvae.init(jmvae_key, model)
+        untrained = tuple(make_detector(k, config, m, windows[m]) for m, k in enumerate(keys))
     fusions: dict[str, Callable[[], Fusion]] = {
         "in_place": lambda: make_in_place(config, params, classes),
         "filter": lambda: filter.init(
@@ -299,45 +308,6 @@ def init(key: Key, config: Config) -> Models:
         q_networks=tuple(agent.init(k) for k in dqn_keys),
         tours=agent.init_tours(tours_key),
     )
-
-
-def _classifiers(
-    key: Key, jmvae_key: Key, config: Config, classes: Belief
-) -> tuple[tuple[Detector, ...], Params]:
-    """Detectors that learn from labels, and the JMVAE of their features."""
-    model = make_jmvae(config)
-    keys = jax.random.split(key, len(config.modalities))
-    untrained = tuple(
-        detectors.init(
-            k, jnp.zeros((2, s.window * s.channels)), size, config.detector, s.measures_distance
-        )
-        for k, s, size in zip(keys, sensors.make(config), model.feature_sizes, strict=True)
-    )
-    return untrained, jmvae.init(jmvae_key, model)
-
-
-def _encoders(
-    key: Key, jmvae_key: Key, config: Config, classes: Belief
-) -> tuple[tuple[Detector, ...], Params]:
-    """Encoders of a JMVAE of scans, and all of its networks."""
-    shape = make_shape(config)
-    params, keys = leave_one_out.init(jmvae_key, shape), jax.random.split(key, len(shape.inputs))
-
-    def untrained(key: Key, sensor: Sensor, size: int) -> Encoder:
-        offset = jnp.zeros(sensor.window * sensor.channels)
-        return Encoder(
-            params=params["encoders"][sensor.name],
-            scaling=Scaling(make_frame(config, sensor), jnp.zeros(size), jnp.float32(1.0)),
-            gate=gate.init(key, offset, jnp.float32(1.0), sensor.measures_distance),
-            classes=classes,
-            readout=make_readout(config, classes),
-            prior=make_prior(config),
-            sharpness=jnp.float32(1.0),
-            shape=shape,
-            label_of_class=config.label_of_class(sensor.name),
-        )
-
-    return tuple(map(untrained, keys, sensors.make(config), shape.inputs)), params
 
 
 def _no_values(config: Config, modality: str) -> LookValues:

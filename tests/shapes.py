@@ -67,7 +67,7 @@ def main() -> None:
         "kl_divergence": lambda: vae.kl_divergence(two, two, jnp.zeros(3), two),
         "bayes_update": lambda: vae.bayes_update(two, look, jnp.zeros(2)),
         "observe": lambda: mdp.looks.observe(KEY, jnp.arange(3), jnp.arange(1), 0),
-        "detect": lambda: vae.detect(models.detectors[0], jnp.zeros((1, 240))),
+        "detect": lambda: vae.detect(models.detectors[0], jnp.zeros((1, 240)), jnp.ones(())),
         "update": lambda: models.fusion.update(models.fusion.prior, two, look, 1),
     }
     refused = {}

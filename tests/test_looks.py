@@ -23,6 +23,7 @@ from jaxsense.vae.jmvae import Jmvae
 CONFIG = replace(PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(8,)))
 MODEL = Jmvae(CONFIG.modalities, (2, 2), 2, (8,))
 NUM_LOOKS = 1024
+PARTS = slice(500), slice(500, None)
 
 
 @pytest.fixture(scope="module")
@@ -242,21 +243,24 @@ def trained(world):
         class_key, survey_key = jax.random.split(key)
         classes = looks.balanced_classes(class_key, CONFIG, number)
         keys = jax.random.split(survey_key, number)
-        return classes, looks.surveys(keys, world, classes)[1]
+        return classes, *looks.surveys(keys, world, classes)[1:]
 
-    classes, surveyed = jax.jit(survey)(jax.random.key(0))
+    classes, surveyed, distances = jax.jit(survey)(jax.random.key(0))
     config, found = replace(CONFIG.detector, steps=200), []
-    for name, of_sensor in zip(CONFIG.modalities, surveyed, strict=True):
-        by_class = jnp.stack([of_sensor[classes == c] for c in range(3)])
-        windows, new = jnp.split(by_class, [500], axis=1)
-        flat = windows.reshape(-1, windows.shape[-1])
+    for m, name in enumerate(CONFIG.modalities):
+        given = detectors.Looks(surveyed[m], distances[:, m])
+        by_class = jax.tree.map(lambda x: jnp.stack([x[classes == c] for c in range(3)]), given)
+        windows, new = (jax.tree.map(lambda x: x[:, part], by_class) for part in PARTS)  # noqa: B023
+        flat = jax.tree.map(lambda x: x.reshape(1500, *x.shape[2:]), windows)
         labels = jnp.array(CONFIG.label_of_class(name))
-        detector = detectors.init(jax.random.key(1), flat, 2, config)
-        problem = detectors.Fitting(config, detector, flat, jnp.repeat(labels, 500))
+        detector = detectors.init(jax.random.key(1), flat.windows, 2, config)
+        nothing = replace(flat, windows=jnp.zeros_like(flat.windows))
+        labels = jnp.repeat(labels, 500)
+        problem = detectors.Fitting(config, detector, flat, labels, nothing)
         start = supervised.start(detector.params, config)
         fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, 200))  # noqa: B023
         state, _ = fit(jax.random.key(2), start)
-        found.append((replace(detector, params=state.params), windows, new))
+        found.append((replace(detector, params=state.params), windows.windows, new))
     return found
 
 
@@ -293,8 +297,9 @@ def windows_of(request, trained):
 def features(windows_of, look_live):
     """A modality, and features `[C, S, 2]` from the bank and, live, with their `[S]` classes."""
     modality, detector, _, new = windows_of
-    bank = jax.jit(jax.vmap(jax.vmap(detectors.detect, in_axes=(None, 0)), in_axes=(None, 0)))
-    return modality, np.asarray(bank(detector, new)), jax.tree.map(np.asarray, look_live(modality))
+    bank = jax.jit(jax.vmap(jax.vmap(detectors.features, (None, 0, 0)), (None, 0, 0)))
+    found = np.asarray(bank(detector, new.windows, new.distances))
+    return modality, found, jax.tree.map(np.asarray, look_live(modality))
 
 
 @pytest.mark.slow

@@ -51,7 +51,8 @@ def learn(config):
     keys = jax.random.split(jax.random.key(0), 8)
     windows = jax.random.normal(keys[0], (12, 3))
     detector = detectors.init(keys[1], windows, 2, config.detector)
-    problem = detectors.Fitting(config.detector, detector, windows, jnp.arange(12) % 2)
+    looks = detectors.Looks(windows, jnp.ones(12))
+    problem = detectors.Fitting(config.detector, detector, looks, jnp.arange(12) % 2, looks)
     state = supervised.start(detector.params, config.detector)
     fit, _ = supervised.fit(keys[2], state, problem, config.detector.steps)
 

@@ -37,7 +37,7 @@ class NavigationConfig(Section, place="navigation"):
 class SearchConfig(Section, place="mission.localisation.search"):
     """Robots with localisation errors search their scans for the PoI; off by default.
 
-    The gate judges all windows and distances that errors up to these could explain. A robot also
+    The detector judges all windows and distances that such errors could explain. A robot also
     keeps a distance of at least `viewpoint.min_distance` plus `position` from the PoI.
     """
 

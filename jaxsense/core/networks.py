@@ -97,14 +97,14 @@ def statistics(
     return offset, jnp.sqrt(jnp.mean(jnp.square(deviation))) + 1e-6
 
 
-def scale_last(network: MLP, params: Params, factor: float | jax.Array) -> Params:
+def scale_last(network: MLP, params: Params, factor: Float[Array, "..."] | float) -> Params:
     """Multiplies the last layer, and so the outputs, of an `MLP`.
 
     Args:
       network: the network.
       params: its parameters.
-      factor: `[]` what to multiply with.
+      factor: of all outputs, or `[A]` of each.
     """
     layers, last = dict(params["params"]), f"Dense_{len(network.hidden)}"
-    layers[last] = jax.tree.map(lambda x: factor * x, layers[last])
+    layers[last] = jax.tree.map(lambda x: jnp.broadcast_to(factor, x.shape) * x, layers[last])
     return {**params, "params": layers}

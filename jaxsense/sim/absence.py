@@ -19,12 +19,11 @@ class View:
     """What one look depends on: where everything stands, and where the robot expects the PoI.
 
     Attributes:
-      positions: `[N, 2]` centres of the PoIs, in metres.
-      poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
-      twin: `[2]` position of one more robot that carries the same sensor, in metres; outside the
-        walls if there is none.
-      bearing: `[]` believed bearing of the PoI in the robot's frame, in radians.
-      distance: `[]` expected distance of the PoI's centre, in metres.
+      positions: centres of the PoIs, in metres.
+      poses: x [m], y [m] and yaw [rad] of each robot.
+      twin: one more robot that carries the same sensor; outside the walls if there is none.
+      bearing: believed bearing of the PoI in the robot's frame, in radians.
+      distance: expected distance of the PoI's centre, in metres.
     """
 
     positions: Float[Array, "N 2"]
@@ -50,50 +49,43 @@ def without_poi(
 ) -> View:
     """Changes a look so that it does not show its PoI.
 
-    It draws one of these situations: an empty place; a wall at any distance; nothing at all, as
-    outside the arena; a wrong bearing; or a robot before the PoI or in its place.
-
-    Args:
-      key: random key.
-      sensors: of all robots.
-      arena: the sizes of arena and PoIs.
-      viewpoint: the distances at which robots expect PoIs.
-      view: a look at the PoI from a free viewpoint.
-      robot: index of the robot, which may be traced.
-      poi: index of the PoI.
+    Draws one of these situations: an empty place; a wall at any distance; nothing at all, as
+    outside the arena; a wrong bearing; or a robot before the PoI or in its place. `view` is a look
+    at the PoI from a free viewpoint.
     """
     draws = jax.random.uniform(key, (10,))
+    situation, x, y, yaw, depth, off, stay, near_by, beside, alone = draws
     limits = np.cumsum(list(_SHARES.values())) / sum(_SHARES.values())
-    drawn = jnp.searchsorted(jnp.array(limits, jnp.float32), draws[0], side="right")
+    drawn = jnp.searchsorted(jnp.array(limits, jnp.float32), situation, side="right")
     kind = {name: drawn == i for i, name in enumerate(_SHARES)}
     away, pose = jnp.array(outside(arena)), view.poses[robot]
 
     # Where the robot stands, and where it expects a PoI.
     play = arena.side / 2 - amiro.BODY_RADIUS
-    turn = jnp.pi * (2 * draws[3] - 1)
-    anywhere = jnp.stack([play * (2 * draws[1] - 1), play * (2 * draws[2] - 1), turn])
+    turn = jnp.pi * (2 * yaw - 1)
+    anywhere = jnp.stack([play * (2 * x - 1), play * (2 * y - 1), turn])
     beyond = jnp.stack([-away[0], away[1], turn / 3])  # looks away from the arena
     pose = jnp.where(kind["wall"], anywhere, jnp.where(kind["outside"], beyond, pose))
     near, far = viewpoint.min_distance, viewpoint.max_distance
-    any_distance = near + (far - near) * draws[4]
+    any_distance = near + (far - near) * depth
     is_there = kind["off"] | kind["covered"]
     distance = jnp.where(is_there, view.distance, any_distance)
-    wrong = _wrong_bearing(draws[5], sensors, arena, view, robot)
+    wrong = _wrong_bearing(off, sensors, arena, view, robot)
     bearing = jnp.where(kind["off"], wrong, view.bearing)
 
     # The PoIs, and the twin.
     direction = pose[2] + view.bearing
     ahead = jnp.stack([jnp.cos(direction), jnp.sin(direction)])
     left = jnp.stack([-ahead[1], ahead[0]])
-    keeps_others = (draws[6] < 0.5) & ~(kind["wall"] | kind["off"])
+    keeps_others = (stay < 0.5) & ~(kind["wall"] | kind["off"])
     positions = jnp.where(keeps_others, view.positions, away[None])
     positions = positions.at[poi].set(jnp.where(is_there, view.positions[poi], away))
     half_width = jnp.array([_half_width(sensor) for sensor in sensors])[robot]
     least = jnp.maximum(_MIN_DISTANCE / distance, 0.15)
-    share = jnp.where(kind["covered"], least + (0.7 - least) * draws[7], least + draws[7])
-    aside = 0.7 * half_width * (2 * draws[8] - 1)
+    share = jnp.where(kind["covered"], least + (0.7 - least) * near_by, least + near_by)
+    aside = 0.7 * half_width * (2 * beside - 1)
     twin = pose[:2] + share * distance * ahead + aside * left
-    has_twin = kind["covered"] | kind["robot"] | ((draws[9] < 0.25) & kind["wall"])
+    has_twin = kind["covered"] | kind["robot"] | ((alone < 0.25) & kind["wall"])
     return View(
         positions=positions,
         poses=view.poses.at[robot].set(pose),

@@ -11,16 +11,18 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Key, Samples, pytree
+from jaxsense.models import make_detector
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene
-from jaxsense.training import gating
-from jaxsense.training.gating import Examples
 from jaxsense.training.stage import Stage, fit_stage
 from jaxsense.training.surveys import Surveys, held_out_per_class, num_scenes, num_starts
 from jaxsense.vae import detectors
-from jaxsense.vae import gate as gates
-from jaxsense.vae.detectors import Classifier, Detector
+from jaxsense.vae.detectors import Classifier, Detector, Looks
+
+_NUM_CHECKS = 8192  # the most looks of each kind that set a threshold
+_SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
+_ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
 
 
 @pytree
@@ -55,55 +57,98 @@ class Detections:
     windows: tuple[Float[Array, "C 1 F"], ...]
 
 
-def split_examples(key: Key, config: Config, *, surveys: Surveys) -> tuple[Examples, ...]:
-    """What to train each detector and its gate on, besides the windows of the surveys.
+def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Looks, ...]:
+    """Looks that show no PoI, for each modality in random order.
 
-    Args:
-      key: random key of the windows that are spoilt by hand.
-      config: all settings.
-      surveys: of all scenes.
+    Empty ones, and looks at PoIs that are spoilt by hand: most of their readings are lost, all are
+    equal, or the PoI is expected at another distance.
     """
-    _, num_bank, _, num_empty = num_scenes(config)
+    *_, num_empty = num_scenes(config)
+    limits = config.viewpoint
 
-    def of_modality(key: Key, m: int, name: str, sensor: Sensor) -> Examples:
-        shown, classes = surveys.training.looks(m), surveys.training.classes.reshape(-1)
-        empty = surveys.others.of_scenes(slice(-num_empty, None)).looks(m)
-        checks = surveys.others.of_scenes(slice(num_bank)).looks(m)
-        return Examples(
-            labels=jnp.array(config.label_of_class(name))[classes],
-            distances=shown.distances,
-            nothing=gating.nothing(key, config.viewpoint, sensor, shown, empty),
-            checks=jax.tree.map(lambda x: x[: gating.NUM_CHECKS], checks),
-        )
+    def of_modality(key: Key, m: int, sensor: Sensor) -> Looks:
+        keys = jax.random.split(key, 5)
+        lost_key, share_key, level_key, distance_key, order_key = keys
+        shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], surveys.training.looks(m))
+        windows, distances = shown.windows, shown.distances
+        number = windows.shape[:1]
+        blind = jnp.minimum(sensor.blind, sensor.window_limit)
+        share = jax.random.uniform(share_key, (*number, 1), minval=0.6)
+        lost = jax.random.uniform(lost_key, windows.shape) < share
+        levels = jax.random.uniform(level_key, (*number, 1)) * jnp.max(windows)
+        is_zero, is_blind = (jnp.arange(number[0])[:, None] % 4 == i for i in (0, 1))
+        levels = jnp.where(is_zero, 0.0, jnp.where(is_blind, blind, levels))
+        near, far = limits.min_distance, limits.max_distance
+        expected = jax.random.uniform(distance_key, number, minval=near, maxval=far)
+        ratio = expected / distances
+        is_elsewhere = (ratio < _ELSEWHERE[0]) | (ratio > _ELSEWHERE[1])
+        parts = [
+            surveys.others.of_scenes(slice(-num_empty, None)).looks(m),
+            Looks(jnp.where(lost, blind, windows), distances),
+            Looks(jnp.broadcast_to(levels, windows.shape), distances),
+            # Where it is expected about right, an empty window instead.
+            Looks(jnp.where(is_elsewhere[:, None], windows, blind), expected),
+        ]
+        together = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        order = jax.random.permutation(order_key, len(together.windows))
+        return jax.tree.map(lambda x: x[order], together)
 
-    keys = jax.random.split(key, len(config.modalities))
-    names, made = config.modalities, sensors.make(config)
-    return tuple(of_modality(keys[m], m, names[m], made[m]) for m in range(len(names)))
+    keys, made = jax.random.split(key, len(config.modalities)), sensors.make(config)
+    return tuple(of_modality(keys[m], m, sensor) for m, sensor in enumerate(made))
+
+
+def fitting(
+    config: Config, detector: Classifier, shown: Looks, labels: Int[Array, " S"], nothing: Looks
+) -> detectors.Fitting:
+    """Problem of fitting a detector, without the looks that `fitted` uses."""
+    rest = jax.tree.map(lambda x: x[_num_checks(nothing) :], nothing)
+    return detectors.Fitting(config.detector, detector, shown, labels, rest)
+
+
+def fitted(
+    config: Config, detector: Classifier, surveys: Surveys, modality: int, nothing: Looks
+) -> Classifier:
+    """Sets the threshold and the odds of a trained detector, with looks of the bank."""
+    num_bank = num_scenes(config)[1]
+    shown = surveys.others.of_scenes(slice(num_bank)).looks(modality)
+    checks = jax.tree.map(lambda x: x[:_NUM_CHECKS], shown)
+    return detectors.fitted(
+        detector, checks, jax.tree.map(lambda x: x[: _num_checks(nothing)], nothing)
+    )
+
+
+def _num_checks(nothing: Looks) -> int:
+    """Number of looks at nothing that set the threshold; the others train the detector."""
+    return min(len(nothing.distances) // 4, _NUM_CHECKS)
 
 
 def detector_stage(modality: int, config: Config) -> Stage:
     """Makes the stage that trains the detector of one modality, by its index."""
 
+    def labelled(config: Config, surveys: Surveys) -> tuple[Looks, jax.Array, int]:
+        """Looks at PoIs, their labels, and how many to train with; the others calibrate."""
+        labels = jnp.array(config.label_of_class(config.modalities[modality]))
+        of_looks = labels[surveys.training.classes.reshape(-1)]
+        return (
+            surveys.training.looks(modality),
+            of_looks,
+            config.detector.num_training(len(of_looks)),
+        )
+
     def untrained(
-        key: Key, config: Config, *, surveys: Surveys, examples: tuple[Examples, ...]
-    ) -> tuple[Classifier, tuple[Params, Params]]:
-        num_labels = len(config.labels(config.modalities[modality]))
-        number = _num_training(config, examples[modality])
-        windows = surveys.training.looks(modality).windows[:number]
-        is_range = sensors.make(config)[modality].measures_distance
-        detector = detectors.init(key, windows, num_labels, config.detector, is_range)
-        return detector, (detector.params, detector.gate.params)
+        key: Key, config: Config, *, surveys: Surveys, examples: tuple[Looks, ...]
+    ) -> tuple[Classifier, Params]:
+        del examples
+        shown, _, number = labelled(config, surveys)
+        detector = make_detector(key, config, modality, shown.windows[:number])
+        return detector, detector.params
 
     def problem(
-        config: Config, detector: Classifier, *, surveys: Surveys, examples: tuple[Examples, ...]
-    ) -> gating.FittingBoth:
-        number = _num_training(config, examples[modality])
-        given = gating.first(examples[modality], number)
-        windows = surveys.training.looks(modality).windows[:number]
-        return gating.FittingBoth(
-            detectors.Fitting(config.detector, detector, windows, given.labels),
-            gating.of_gate(config.detector, detector.gate, given, windows),
-        )
+        config: Config, detector: Classifier, *, surveys: Surveys, examples: tuple[Looks, ...]
+    ) -> detectors.Fitting:
+        shown, labels, number = labelled(config, surveys)
+        first = jax.tree.map(lambda x: x[:number], shown)
+        return fitting(config, detector, first, labels[:number], examples[modality])
 
     def trained(
         config: Config,
@@ -111,16 +156,14 @@ def detector_stage(modality: int, config: Config) -> Stage:
         fit: FitState,
         *,
         surveys: Surveys,
-        examples: tuple[Examples, ...],
+        examples: tuple[Looks, ...],
     ) -> Classifier:
-        given = examples[modality]
-        number = _num_training(config, given)
-        params, of_gate = fit.params
-        gate = gates.fitted(of_gate, gating.checks_of(config.detector, detector.gate, given))
-        found = dataclasses.replace(detector, params=params, gate=gate)
-        windows = surveys.training.looks(modality).windows[number:]
-        labels = given.labels[number:]
-        return detectors.calibrate(found, windows, labels) if len(labels) else found
+        found = dataclasses.replace(detector, params=fit.params)
+        shown, labels, number = labelled(config, surveys)
+        others = jax.tree.map(lambda x: x[number:], shown)
+        if number < len(labels):
+            found = detectors.calibrate(found, others, labels[number:])
+        return fitted(config, found, surveys, modality, examples[modality])
 
     return fit_stage(
         f"detector_{config.modalities[modality]}",
@@ -129,11 +172,6 @@ def detector_stage(modality: int, config: Config) -> Stage:
         problem=problem,
         trained=trained,
     )
-
-
-def _num_training(config: Config, examples: Examples) -> int:
-    """How many examples train the detector; the others calibrate it."""
-    return config.detector.num_training(len(examples.labels))
 
 
 def detect(
@@ -146,18 +184,12 @@ def detect(
 ) -> Detections:
     """Applies the detectors to the surveys that they were not trained on.
 
-    Args:
-      key: not used.
-      config: all settings.
-      surveys: of all scenes.
-      trained: one detector for each modality.
-      taken_for: `[S, N]` int32 classes by which looks for training are sorted; by default the true
-        ones.
+    Looks for training are sorted by `[S, N]` classes `taken_for`, by default the true ones.
     """
     del key
     _, num_bank, _, num_empty = num_scenes(config)
     others = surveys.others.of_scenes(slice(-num_empty))
-    features = looks.detect_all(trained, others.windows)
+    features = looks.features(trained, others.windows, others.distances)
 
     def by_class(
         values: tuple[jax.Array, ...], part: slice, classes: jax.Array, number: int

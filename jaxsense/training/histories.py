@@ -20,11 +20,6 @@ def draw(
 ) -> tuple[Int[Array, " T"], tuple[Float[Array, "T D_m"], ...]]:
     """Draws a history of looks at a PoI.
 
-    Args:
-      key: random key.
-      bank: for each modality `[C, S, D_m]` features of looks at every class.
-      true_class: `[]` int32.
-
     Returns:
       `[T]` int32 modality of each look, and for each modality `[T, D_m]` features, of which only
       those of this modality count.
@@ -48,20 +43,17 @@ def readout_error(
 ) -> Float[Array, ""]:
     """Nats that class probabilities lose when a belief holds them.
 
-    Exact Bayes gives the probabilities after each look of random histories. The belief with the
-    moments of their mixture is as good as a belief can be.
+    Mean divergence after the number of looks where it is largest. Exact Bayes gives the
+    probabilities after each look of random histories; the belief with the moments of their mixture
+    is as good as a belief can be.
 
     Args:
       key: random key.
       config: all settings.
-      bank: for each modality `[C, S, D_m]` features of looks at every class.
+      bank: features of looks at every class.
       classes: `[C, D]` mean joint posterior of each class.
       read: class probabilities of a belief.
       number: of histories; static.
-
-    Returns:
-      `[]` mean divergence of the probabilities read from those held, after the number of looks
-      where it is largest.
     """
     exact = make_bayes(config)
 

@@ -13,25 +13,16 @@ from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call,
 from jaxsense.models import make_bayes
 from jaxsense.training import histories
 from jaxsense.training.detections import Detections
-from jaxsense.vae import calibration, latent
+from jaxsense.vae import detectors, gaussian, readout
 
 _HISTORIES_AT_ONCE = 512
+_ACTIVE_VARIANCE = 0.01
 
 
 def detector_metrics(
     key: Key, config: Config, *, detections: Detections
 ) -> dict[str, dict[str, Float[Array, ""]]]:
-    """Measures the detectors on held-out scans.
-
-    Args:
-      key: not used.
-      config: all settings.
-      detections: of all sensors.
-
-    Returns:
-      For each modality `accuracy`, the expected calibration error `ece`, and the negative
-      log-likelihood `nll` in nats.
-    """
+    """Accuracy, expected calibration error `ece` and `nll` in nats, of held-out scans."""
     del key
 
     def measure(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array]:
@@ -39,8 +30,8 @@ def detector_metrics(
         flat = looks.reshape(-1, looks.shape[-1])
         return {
             "accuracy": jnp.mean(looks.argmax(axis=-1) == label_of_class[:, None]),
-            "ece": calibration.calibration_error(flat, labels),
-            "nll": calibration.negative_log_likelihood(flat, labels),
+            "ece": detectors.calibration_error(flat, labels),
+            "nll": detectors.negative_log_likelihood(flat, labels),
         }
 
     return {
@@ -50,17 +41,12 @@ def detector_metrics(
 
 
 def reliability(config: Config, held_out: Samples) -> dict[str, Reliability]:
-    """Reliability diagrams of the detectors of all modalities.
-
-    Args:
-      config: all settings.
-      held_out: `[C, S, D_m]` features of held-out looks.
-    """
+    """Reliability diagrams of all detectors, from `[C, S, D_m]` features of held-out looks."""
     found = {}
     for name, looks in zip(config.modalities, held_out, strict=True):
         labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
         flat = jnp.asarray(looks).reshape(-1, looks.shape[-1])
-        found[name] = jax.tree.map(np.asarray, calibration.reliability(flat, labels))
+        found[name] = jax.tree.map(np.asarray, detectors.reliability(flat, labels))
     return found
 
 
@@ -75,7 +61,7 @@ class LatentSpace:
         class is plausible.
       consistent: for `joint` and each modality `[C]` share of looks after which exactly the classes
         are plausible that the sensor cannot distinguish from the true one.
-      moment_matching_error: `[]` mean of `latent.moment_matching_error`.
+      moment_matching_error: `[]` mean of `moment_matching_error`.
       readout_error: `[]` nats lost between writing a belief and reading it, see
         `histories.readout_error`.
       fusion: `accuracy`, `mean_error` and `std_error` of beliefs after a look by one modality and
@@ -99,12 +85,6 @@ def latent_space(
     The s-th look at a class by one modality is paired with the s-th by another. Non-finite
     parameters and features raise no error: check the beliefs.
 
-    Args:
-      key: random key.
-      config: all settings.
-      fusion: how looks update the map.
-      detections: of all sensors.
-
     Returns:
       `[C, S, D]` beliefs for `joint` and for each modality alone, and the metrics.
     """
@@ -115,9 +95,9 @@ def latent_space(
     same = np.eye(len(class_means), dtype=bool)
     consistent = {
         "joint": same,
-        **{m: latent.consistent_classes(config.label_of_class(m)) for m in config.modalities},
+        **{m: consistent_classes(config.label_of_class(m)) for m in config.modalities},
     }
-    plausible = jax.vmap(jax.vmap(lambda b: latent.plausible_classes(b, class_means)))
+    plausible = jax.vmap(jax.vmap(lambda b: readout.plausible_classes(b, class_means)))
     open_classes = {name: plausible(belief) for name, belief in found.items()}
 
     def share(
@@ -126,11 +106,11 @@ def latent_space(
         return jnp.all(is_open == expected[:, None], axis=-1).mean(axis=1)
 
     return found, LatentSpace(
-        active_units=latent.active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
-        sigma_norm={n: latent.sigma_norm(b.std).mean(axis=1) for n, b in found.items()},
+        active_units=active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
+        sigma_norm={n: readout.sigma_norm(b.std).mean(axis=1) for n, b in found.items()},
         unambiguous={n: share(x, same) for n, x in open_classes.items()},
         consistent={n: share(x, consistent[n]) for n, x in open_classes.items()},
-        moment_matching_error=_moment_matching_error(joint, alone, config),
+        moment_matching_error=_mean_error(joint, alone, config),
         readout_error=histories.readout_error(
             key, config, bank, fusion.classes, fusion.class_probabilities
         ),
@@ -145,16 +125,38 @@ def _beliefs(fusion: Fusion, bank: Samples, members: Iterable[int]) -> Belief:
     return jax.vmap(jax.vmap(together))(bank)
 
 
-def _moment_matching_error(joint: Belief, alone: list[Belief], config: Config) -> Float[Array, ""]:
+def active_units(mean: Float[Array, "S D"]) -> Int[Array, ""]:
+    """Number of latent dimensions whose posterior means vary (Burda et al. 2016, Sec. 5.2)."""
+    return jnp.sum(jnp.var(mean, axis=0) > _ACTIVE_VARIANCE)
+
+
+def consistent_classes(label_of_class: tuple[int, ...]) -> Bool[np.ndarray, "C C"]:
+    """Pairs of classes that a modality with these labels of the classes cannot distinguish."""
+    labels = np.array(label_of_class)
+    return labels[:, None] == labels[None, :]
+
+
+def moment_matching_error(belief: Belief, components: Belief) -> Float[Array, ""]:
+    """Distance of a `[D]` uni-modal posterior from the moment-matched `[K, D]` joint posteriors.
+
+    Mean over the dimensions of `|mean difference|`, in matched standard deviations, plus
+    `|log(std ratio)|`.
+    """
+    mean, std = gaussian.moment_match(components.mean, components.std)
+    shift = jnp.abs(belief.mean - mean) / std
+    return jnp.mean(shift + jnp.abs(jnp.log(belief.std / std)))
+
+
+def _mean_error(joint: Belief, alone: list[Belief], config: Config) -> Float[Array, ""]:
     """Mean distance of uni-modal posteriors from their moment-matched targets."""
     errors = []
     for modality, belief in zip(config.modalities, alone, strict=True):
         labels = config.label_of_class(modality)
-        for c, consistent in enumerate(latent.consistent_classes(labels)):
+        for c, consistent in enumerate(consistent_classes(labels)):
             members = jnp.array(np.flatnonzero(consistent))
             parts = jax.tree.map(lambda x: x[members].reshape(-1, x.shape[-1]), joint)  # noqa: B023
             of_class = jax.tree.map(lambda x: x[c], belief)  # noqa: B023
-            errors.append(jax.vmap(latent.moment_matching_error, (0, None))(of_class, parts))
+            errors.append(jax.vmap(moment_matching_error, (0, None))(of_class, parts))
     return jnp.mean(jnp.stack(errors))
 
 
@@ -163,7 +165,7 @@ def _fusion_metrics(
 ) -> dict[str, Float[Array, ""] | None]:
     """Quality of beliefs after a look by one modality and then by another."""
     is_right, distances, widths = [], [], []
-    shown = jax.vmap(jax.vmap(lambda b: latent.nearest_class(b, fusion.classes.mean)))
+    shown = jax.vmap(jax.vmap(lambda b: readout.nearest_class(b, fusion.classes.mean)))
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
         update = lambda old, new: fusion.update(old, seen, new, second)  # noqa: B023, E731
@@ -186,12 +188,6 @@ def beliefs(
     """Compares beliefs after random histories of looks with exact Bayes.
 
     All looks of a history are at one PoI, each by a random modality.
-
-    Args:
-      key: random key.
-      config: all settings.
-      fusion: how looks update the map.
-      detections: of all sensors.
 
     Returns:
       The block `belief` of the summary as arrays. After 1 to K `looks`: `[K]` negative

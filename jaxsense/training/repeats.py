@@ -62,11 +62,14 @@ def novelty_stage(
 
         def fit(m: int) -> tuple[jax.Array, jax.Array]:
             scene_keys = jax.random.split(keys[m], number)
-            windows, places = looks.repeats(
+            *seen, places = looks.repeats(
                 scene_keys, world, drawn.classes, m, _REPEATS, drawn.places
             )
-            read = lambda x: exact.log_likelihoods(detectors.detect(trained[m], x), m)  # noqa: E731
-            return novelty.fit(jax.vmap(jax.vmap(read))(windows), places, drawn.taken_for)
+
+            def read(*look: jax.Array) -> jax.Array:
+                return exact.log_likelihoods(detectors.features(trained[m], *look), m)
+
+            return novelty.fit(jax.vmap(jax.vmap(read))(*seen), places, drawn.taken_for)
 
         strength, length = zip(*map(fit, range(len(trained))), strict=True)
         return Novelty(jnp.stack(strength), jnp.stack(length))

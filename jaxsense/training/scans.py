@@ -12,20 +12,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
-from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.models import make_frame, make_prior, make_readout, make_shape
+from jaxsense.models import make_encoder, make_frame, make_shape
 from jaxsense.sim import sensors
-from jaxsense.training import detections, gating, stage
+from jaxsense.training import detections, stage
 from jaxsense.training.detections import Detections
-from jaxsense.training.gating import Examples
 from jaxsense.training.repeats import Repeated
 from jaxsense.training.stage import Stage, fit_stage
 from jaxsense.training.surveys import Scenes, Survey, Surveys, num_scenes
-from jaxsense.vae import clusters, frames, leave_one_out
-from jaxsense.vae import gate as gates
+from jaxsense.vae import detectors, frames, leave_one_out
+from jaxsense.vae.detectors import Looks
 from jaxsense.vae.frames import Scaling
 from jaxsense.vae.leave_one_out import Encoder, Groups
 
@@ -140,16 +138,16 @@ def class_beliefs(
     number, num_classes = _num_training(config), len(config.arena.classes)
     found = _posteriors(params, config, views.groups)
     truth = surveys.training.classes[: number : config.jmvae.num_together].reshape(-1)
-    centres = clusters.centres(key, found.mean[:_CLUSTERED], num_classes)
-    members = clusters.nearest(found.mean, centres)
-    of_class = clusters.named(members, truth, num_classes)
+    centres = leave_one_out.centres(key, found.mean[:_CLUSTERED], num_classes)
+    members = leave_one_out.nearest(found.mean, centres)
+    of_class = leave_one_out.named(members, truth, num_classes)
     is_member = (members[None] == of_class[:, None]).astype(jnp.float32)
     share = is_member / jnp.maximum(jnp.sum(is_member, axis=1, keepdims=True), 1)
     return jax.tree.map(lambda x: jnp.sum(share[..., None] * x[None], axis=1), found)
 
 
 def encoder_stage(modality: int, config: Config) -> Stage:
-    """Makes the stage that makes a detector of one modality's encoder, and trains its gate."""
+    """The stage that makes a detector of the encoder of one modality: it learns where PoIs are."""
 
     def num_looks(config: Config) -> int:
         return _num_training(config) * config.arena.num_pois
@@ -159,56 +157,46 @@ def encoder_stage(modality: int, config: Config) -> Stage:
         config: Config,
         *,
         surveys: Surveys,
-        examples: tuple[Examples, ...],
+        examples: tuple[Looks, ...],
         params: Params,
         views: Views,
         classes: Belief,
         shown: Shown,
     ) -> tuple[Encoder, Params]:
         del examples
-        sensor, number = config.modalities[modality], num_looks(config)
-        windows = surveys.training.looks(modality).windows
-        offset, scale = networks.statistics(windows[:number])
-        is_range = sensors.make(config)[modality].measures_distance
-        encoder = Encoder(
-            params=params["encoders"][sensor],
-            scaling=views.scalings[modality],
-            gate=gates.init(key, offset, scale, is_range),
-            classes=classes,
-            readout=make_readout(config, classes),
-            prior=make_prior(config),
-            sharpness=jnp.float32(1.0),
-            shape=make_shape(config),
-            label_of_class=config.label_of_class(sensor),
-        )
-        others, taken_for = windows[number:], shown.calibrating.reshape(-1)
-        if len(others):
-            encoder = leave_one_out.calibrate(encoder, others, taken_for)
-        return encoder, encoder.gate.params
+        number, windows = num_looks(config), surveys.training.looks(modality).windows
+        scaling = views.scalings[modality]
+        encoder = make_encoder(key, config, modality, windows[:number], params, scaling, classes)
+        if number < len(windows):
+            taken_for = shown.calibrating.reshape(-1)
+            encoder = leave_one_out.calibrate(encoder, windows[number:], taken_for)
+        return encoder, encoder.presence.params
 
     def problem(
         config: Config,
         encoder: Encoder,
         *,
         surveys: Surveys,
-        examples: tuple[Examples, ...],
+        examples: tuple[Looks, ...],
         **_: object,
-    ) -> gates.Fitting:
-        number = num_looks(config)
-        given = gating.first(examples[modality], number)
-        windows = surveys.training.looks(modality).windows[:number]
-        return gating.of_gate(config.detector, encoder.gate, given, windows)
+    ) -> detectors.Fitting:
+        number, looks = num_looks(config), surveys.training.looks(modality)
+        first, one_label = jax.tree.map(lambda x: x[:number], looks), jnp.zeros(number, jnp.int32)
+        return detections.fitting(config, encoder.presence, first, one_label, examples[modality])
 
     def trained(
         config: Config,
         encoder: Encoder,
         fit: FitState,
         *,
-        examples: tuple[Examples, ...],
+        surveys: Surveys,
+        examples: tuple[Looks, ...],
         **_: object,
     ) -> Encoder:
-        checks = gating.checks_of(config.detector, encoder.gate, examples[modality])
-        return dataclasses.replace(encoder, gate=gates.fitted(fit.params, checks))
+        presence = dataclasses.replace(encoder.presence, params=fit.params)
+        nothing = examples[modality]
+        presence = detections.fitted(config, presence, surveys, modality, nothing)
+        return dataclasses.replace(encoder, presence=presence)
 
     return fit_stage(
         f"detector_{config.modalities[modality]}",
@@ -299,7 +287,7 @@ def _shown(
         jax.lax.map(jax.vmap(scaling), grouped(x[part], config)[:, :first], batch_size=512)
         for scaling, x in zip(views.scalings, survey.windows, strict=True)
     )
-    return clusters.nearest(_posteriors(params, config, groups).mean, classes.mean)
+    return leave_one_out.nearest(_posteriors(params, config, groups).mean, classes.mean)
 
 
 def accuracies(

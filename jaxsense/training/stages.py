@@ -56,7 +56,7 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
     """
     scenes = drive(Stage("scenes", surveys.draw_scenes))
     surveyed = drive(surveys.survey_stage(arena), scenes=scenes)
-    examples = drive(Stage("examples", detections.split_examples), surveys=surveyed)
+    examples = drive(Stage("examples", detections.looks_at_nothing), surveys=surveyed)
     perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
     detectors, params, classes, detected = perceive(
         drive, config, arena, scenes=scenes, surveys=surveyed, examples=examples

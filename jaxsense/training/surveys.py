@@ -10,7 +10,7 @@ from jaxsense.core.types import Key, pytree
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training.stage import Stage
-from jaxsense.vae import gate as gates
+from jaxsense.vae.detectors import Looks
 
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
 
@@ -31,23 +31,15 @@ class Survey:
     windows: tuple[Float[Array, "S N F"], ...]
     distances: Float[Array, "S M N"]
 
-    def looks(self, modality: int) -> gates.Looks:
-        """All looks by one modality, scene after scene.
-
-        Args:
-          modality: index of the sensor.
-        """
+    def looks(self, modality: int) -> Looks:
+        """All looks by one modality, scene after scene."""
         windows = self.windows[modality]
         # XLA would fold the reshape into sums over the looks, which then round otherwise.
         flat = jax.lax.optimization_barrier(windows.reshape(-1, windows.shape[-1]))
-        return gates.Looks(flat, self.distances[:, modality].reshape(-1))
+        return Looks(flat, self.distances[:, modality].reshape(-1))
 
     def of_scenes(self, part: slice) -> "Survey":
-        """The survey of some of the scenes.
-
-        Args:
-          part: which ones; static.
-        """
+        """The survey of some of the scenes; `part` is static."""
         return jax.tree.map(lambda x: x[part], self)
 
 
@@ -98,10 +90,6 @@ Scenes = tuple[Key, Int[Array, "S N"], Bool[Array, " S"], Key | None]
 
 def draw_scenes(key: Key, config: Config) -> Scenes:
     """Draws keys and classes of all scenes.
-
-    Args:
-      key: random key.
-      config: all settings.
 
     Returns:
       `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, `[S]` bool, in which scenes

@@ -6,8 +6,9 @@ from jaxsense.vae.bayes import product_of_experts as product_of_experts
 from jaxsense.vae.detectors import Classifier as Classifier
 from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
-from jaxsense.vae.detectors import answer as answer
+from jaxsense.vae.detectors import Looks as Looks
 from jaxsense.vae.detectors import detect as detect
+from jaxsense.vae.detectors import features as features
 from jaxsense.vae.detectors import retrain as retrain
 from jaxsense.vae.filter import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace
@@ -19,11 +20,11 @@ from jaxsense.vae.jmvae import Jmvae as Jmvae
 from jaxsense.vae.jmvae import decode as decode
 from jaxsense.vae.jmvae import encode as encode
 from jaxsense.vae.jmvae import init as init
+from jaxsense.vae.jmvae import log_likelihood as log_likelihood
 from jaxsense.vae.jmvae import loss as loss
 from jaxsense.vae.jmvae import posterior as posterior
 from jaxsense.vae.jmvae import train as train
-from jaxsense.vae.latent import nearest_class as nearest_class
-from jaxsense.vae.latent import plausible_classes as plausible_classes
-from jaxsense.vae.latent import sigma_norm as sigma_norm
-from jaxsense.vae.likelihood import log_likelihood as log_likelihood
 from jaxsense.vae.readout import mixture as mixture
+from jaxsense.vae.readout import nearest_class as nearest_class
+from jaxsense.vae.readout import plausible_classes as plausible_classes
+from jaxsense.vae.readout import sigma_norm as sigma_norm

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, pytree
-from jaxsense.vae.calibration import MIN_PROBABILITY
 
+_MIN_PROBABILITY = 1e-12
 _MIN_PRECISION = 1e-6
 
 _Features = Float[Array, " D_m"]
@@ -16,17 +16,14 @@ _Labels = Int[Array | np.ndarray, " C"]
 
 
 def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array, " C"]:
-    """Log-likelihood of each class given one look, from a detector's probabilities.
+    """Log-likelihood of each class given one look, up to a constant.
 
     In the detector's training each label was as frequent as the classes that have it, so
     `p(x | class) ~ p(label | x) / p(label)`.
 
     Args:
       features: `[D_m]` probabilities of the labels.
-      label_of_class: `[C]` int32, the label of each class in this modality.
-
-    Returns:
-      `[C]`, up to a constant.
+      label_of_class: `[C]` int32.
 
     Raises:
       ValueError: if a label does not exist or the features are not probabilities.
@@ -37,7 +34,7 @@ def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array
     checks.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
     prior = jnp.zeros(len(features)).at[label_of_class].add(1 / len(label_of_class))
-    ratio = jnp.maximum(features[label_of_class], MIN_PROBABILITY) / prior[label_of_class]
+    ratio = jnp.maximum(features[label_of_class], _MIN_PROBABILITY) / prior[label_of_class]
     return jnp.log(ratio)
 
 
@@ -47,13 +44,13 @@ def bayes_update(
     label_of_class: _Labels,
     weight: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " C"]:
-    """Updates the exact posterior over the classes with one look.
+    """Exact posterior over the classes after one more look.
 
     Args:
       log_weights: `[C]` logarithms of the classes' probabilities before the look.
       features: see `log_likelihoods`.
       label_of_class: see `log_likelihoods`.
-      weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+      weight: share of the look that is new evidence, see `vae.Novelty`.
 
     Returns:
       `[C]` logarithms after the look, normalised.
@@ -71,11 +68,7 @@ def bayes_update(
 
 @pytree
 class Bayes:
-    """Exact Bayes over the classes for all modalities.
-
-    Attributes:
-      labels: `[M, C]` int32, the label of each class in each modality.
-    """
+    """Exact Bayes over the classes; `labels` `[M, C]` int32 of each class in each modality."""
 
     labels: Int[Array, "M C"]
 
@@ -86,12 +79,7 @@ class Bayes:
         return jnp.full(number, -jnp.log(number), jnp.float32)
 
     def log_likelihoods(self, features: _Features, modality: int) -> Float[Array, " C"]:
-        """Log-likelihood of each class given one look, see the function `log_likelihoods`.
-
-        Args:
-          features: `[D_m]` probabilities of the labels.
-          modality: index of the sensor; static.
-        """
+        """See the function `log_likelihoods`; `modality` is static."""
         return log_likelihoods(features, self.labels[modality])
 
     def update(
@@ -101,14 +89,7 @@ class Bayes:
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Float[Array, " C"]:
-        """Posterior after one more look, see `bayes_update`.
-
-        Args:
-          log_posterior: `[C]` logarithms of the classes' probabilities before the look.
-          features: `[D_m]` probabilities of the labels.
-          modality: index of the sensor; static.
-          weight: see `bayes_update`.
-        """
+        """See `bayes_update`; `modality` is static."""
         return bayes_update(log_posterior, features, self.labels[modality], weight)
 
 
@@ -127,8 +108,7 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
       ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
-        size = None if each is belief else len(belief.mean)
-        checks.require_belief(name, each, size)
+        checks.require_belief(name, each, None if each is belief else len(belief.mean))
     of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
     precision = jnp.maximum(of_belief + of_posterior - of_prior, _MIN_PRECISION)
     total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean

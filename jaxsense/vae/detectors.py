@@ -1,10 +1,12 @@
-"""The scanline detectors f_x and f_w: from one sensor's window to features, through a gate."""
+"""The scanline detectors f_x and f_w: from a window of a scan to a label, or "nothing there"."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
@@ -12,84 +14,46 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import DetectorConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Key, product, pytree
-from jaxsense.vae import calibration
-from jaxsense.vae import gate as gates
-from jaxsense.vae.gate import Gate
+from jaxsense.core.types import Key, Reliability, product, pytree
 
 _NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
-_MIN_PROBABILITY = 1e-9  # whose logarithm counts
+_MIN_PROBABILITY = 1e-9  # whose logarithm counts in a search
+_DEPTH = 0.2  # m, about the size of a PoI
+_MAX_DEPTHS = 2.5
+_MAX_LOST = 0.01  # share of the looks at PoIs
+_MAX_PASSED = 0.002  # share of the looks at nothing, if few looks at PoIs are lost for it
+_FACTORS = np.geomspace(1 / 16, 16, 513, dtype=np.float32)  # on logits, that are tried
+_BINS = 15
 
 
 class Detector(Protocol):
-    """Protocol of a sensor's detector, which maps windows to features; a frozen pytree."""
-
-    @property
-    def gate(self) -> Gate:
-        """Tells which windows show a PoI."""
-        ...
+    """Protocol of a sensor's detector; a frozen pytree."""
 
     @property
     def num_labels(self) -> int:
-        """D_m, the number of labels."""
+        """D_m, without "nothing there"."""
         ...
 
-    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-        """Probabilities of the labels, for a window that shows its PoI.
+    @property
+    def window_size(self) -> int:
+        """F, numbers in a window."""
+        ...
+
+    @property
+    def threshold(self) -> Float[Array, ""]:
+        """Minimum log-odds that the PoI is there, for an answer with a label."""
+        ...
+
+    def logits(
+        self, window: Float[Array, " F"], distance: Float[Array, ""]
+    ) -> Float[Array, " D_m+1"]:
+        """Of the labels and, last, log-odds that the PoI is there, see `log_probabilities`.
 
         Args:
-          window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
+          window: readings around the PoI's bearing, see `sim.windows.as_window`.
+          distance: expected distance of the PoI's centre, in metres.
         """
         ...
-
-
-@pytree
-class Classifier:
-    """A detector that learns from labelled windows.
-
-    Attributes:
-      params: of its network.
-      offset: `[F]` mean of the windows for training.
-      scale: `[]` overall standard deviation of these windows.
-      hidden: sizes of the hidden layers.
-      gate: tells which windows show a PoI.
-      num_labels: D_m, the number of labels.
-    """
-
-    params: Params
-    offset: Float[Array, " F"]
-    scale: Float[Array, ""]
-    gate: Gate
-    hidden: tuple[int, ...] = struct.field(pytree_node=False)
-    num_labels: int = struct.field(pytree_node=False)
-
-    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-        """See `Detector.features`."""
-        return jax.nn.softmax(logits(self, window))
-
-
-def init(
-    key: Key,
-    windows: Float[Array, "S F"],
-    num_labels: int,
-    config: DetectorConfig,
-    measures_distance: bool = False,
-) -> Classifier:
-    """Untrained detector.
-
-    Args:
-      key: random key.
-      windows: `[S, F]` windows for training, whose statistics standardise its input.
-      num_labels: D_m.
-      config: sizes of the network.
-      measures_distance: whether the readings are distances, see `Gate`.
-    """
-    checks.require_shape("windows", windows, (None, None))
-    network_key, gate_key = jax.random.split(key)
-    params = networks.init(network_key, MLP(config.hidden, num_labels), windows.shape[1])
-    offset, scale = networks.statistics(windows)
-    gate = gates.init(gate_key, offset, scale, measures_distance)
-    return Classifier(params, offset, scale, gate, config.hidden, num_labels)
 
 
 @pytree
@@ -108,43 +72,48 @@ class Detection:
     features: Float[Array, " D_m"]
 
 
-def logits(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-    """Unnormalised log-probabilities of the labels.
+@pytree
+class Looks:
+    """Windows, and where each expects its PoI.
 
-    Args:
-      detector: of the sensor.
-      window: `[F]`.
+    Attributes:
+      windows: `[S, F]`.
+      distances: `[S]` expected distances of the PoIs' centres, in metres.
     """
-    return networks.apply(_network(detector), detector.params, _standard(detector, window))
+
+    windows: Float[Array, "S F"]
+    distances: Float[Array, " S"]
+
+
+def log_probabilities(logits: Float[Array, "D_m+1 *B"]) -> Float[Array, "D_m+1 *B"]:
+    """Of the labels and, last, of "nothing there", if half of all looks show nothing.
+
+    A hierarchical softmax (Morin and Bengio 2005): the log-odds that the PoI is there do not depend
+    on its label, and each level has a temperature of its own.
+    """
+    labels, odds = jax.nn.log_softmax(logits[:-1], axis=0), logits[-1:]
+    return jnp.concatenate([labels + jax.nn.log_sigmoid(odds), jax.nn.log_sigmoid(-odds)])
 
 
 @checks.typed
-def detect(detector: Detector, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-    """Computes the features of a look that shows its PoI; `answer` also checks that it does.
-
-    Args:
-      detector: of the sensor.
-      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
-
-    Returns:
-      `[D_m]` probabilities of the labels, for example (red, green).
-    """
-    return detector.features(window)
+def features(
+    detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]
+) -> Float[Array, " D_m"]:
+    """Probabilities of the labels in a look that shows its PoI, for example (red, green)."""
+    checks.require_shape("window", window, (detector.window_size,))
+    return jax.nn.softmax(detector.logits(window, distance)[:-1])
 
 
 @checks.typed
-def answer(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
-    """Evaluates a look: whether the window shows its PoI, and the features.
-
-    Args:
-      detector: of the sensor.
-      window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
-      distance: expected distance of the PoI's centre, in metres.
-    """
-    is_known = gates.is_valid(window, distance)
-    is_there = is_known & (gates.logits(detector.gate, window, distance) >= detector.gate.threshold)
-    features = jnp.where(is_there, detect(detector, window), 1 / detector.num_labels)
-    return Detection(is_known, is_there, features)
+def detect(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
+    """What a look says; `distance` is that of the PoI's centre, in metres."""
+    checks.require_shape("window", window, (detector.window_size,))
+    checks.require_shape("distance", distance, ())
+    found = detector.logits(window, distance)
+    is_known = jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
+    is_there = is_known & (found[-1] >= detector.threshold)
+    of_labels = jnp.where(is_there, jax.nn.softmax(found[:-1]), 1 / detector.num_labels)
+    return Detection(is_known, is_there, of_labels)
 
 
 def search(
@@ -153,86 +122,175 @@ def search(
     distances: Float[Array, " J"],
     log_prior: Float[Array, "J K"],
 ) -> Detection:
-    """What a look says that shows its PoI in one of several windows, at one of several distances.
+    """Detection from several candidate windows and distances, marginalised over both.
 
-    The PoI is there if the gate's mean odds reach its threshold: of many windows that show nothing,
-    the best one would pass too often. The features are the logarithmic pool of all windows (Genest
-    and Zidek 1986), weighted by their posterior, from the prior and the gate: windows next to the
-    best one show the PoI nearly as well, and their mean is less noisy than a single one.
+    The PoI is there if the mean odds reach the threshold: of many windows that show nothing, the
+    best one would pass too often. The features are the logarithmic pool of all candidates (Genest
+    and Zidek 1986), weighted by their posterior: windows next to the best one show the PoI nearly
+    as well, and their mean is less noisy than a single one.
 
     Args:
       detector: of the sensor.
-      windows: `[K, F]`, of which those with a reading that is not finite count for nothing.
-      distances: `[J]` expected distances of the PoI's centre, in metres.
-      log_prior: `[J, K]` logarithm of the prior, up to a constant; minus infinity for what is not
-        to be considered.
+      windows: those with a reading that is not finite count for nothing.
+      distances: expected distances of the PoI's centre, in metres.
+      log_prior: up to a constant; minus infinity for what is not to be considered.
     """
     checks.require_shape("log_prior", log_prior, (len(distances), len(windows)))
-    is_valid = jnp.isfinite(windows).all(axis=1)
-    given = jnp.where(is_valid[:, None], windows, 0.0)
-    is_distance = jnp.isfinite(distances) & (distances > 0)
-    may_be = is_valid[None] & is_distance[:, None] & jnp.isfinite(log_prior)
-    found = jax.vmap(lambda at: gates.logits(detector.gate, given.T, jnp.full(len(given), at)))(
-        jnp.where(is_distance, distances, 1.0)
-    )
-    prior = jax.nn.log_softmax(jnp.where(may_be, log_prior, _NEVER).reshape(-1))
-    odds = jnp.where(may_be.reshape(-1), found.reshape(-1) + prior, _NEVER)
+    is_valid, is_distance = jnp.isfinite(windows).all(axis=1), jnp.isfinite(distances)
+    is_distance &= distances > 0
+    may_be = (is_valid[None] & is_distance[:, None] & jnp.isfinite(log_prior)).reshape(-1)
+    of_windows = jax.vmap(detector.logits, in_axes=(0, None), out_axes=-1)
+    found = jax.vmap(of_windows, in_axes=(None, 0), out_axes=1)(
+        jnp.where(is_valid[:, None], windows, 0.0), jnp.where(is_distance, distances, 1.0)
+    ).reshape(detector.num_labels + 1, -1)
+    prior = jax.nn.log_softmax(jnp.where(may_be, log_prior.reshape(-1), _NEVER))
+    odds = jnp.where(may_be, found[-1] + prior, _NEVER)
     is_known = jnp.any(may_be)
-    is_there = is_known & (jax.nn.logsumexp(odds) >= detector.gate.threshold)
-    share = jax.nn.softmax(odds).reshape(may_be.shape).sum(axis=0)
-    logs = jnp.log(jnp.maximum(jax.vmap(detector.features)(given), _MIN_PROBABILITY))
-    pooled = jax.nn.softmax(product(share, logs))
+    is_there = is_known & (jax.nn.logsumexp(odds) >= detector.threshold)
+    logs = jnp.maximum(jax.nn.log_softmax(found[:-1], axis=0), jnp.log(_MIN_PROBABILITY))
+    pooled = jax.nn.softmax(product(logs, jax.nn.softmax(odds)))
     return Detection(is_known, is_there, jnp.where(is_there, pooled, 1 / detector.num_labels))
 
 
-def _standard(detector: Classifier, window: Float[Array, " F"]) -> Float[Array, " F"]:
-    """A window standardised by those of the training."""
-    checks.require_shape("window", window, detector.offset.shape)
-    return (window - detector.offset) / detector.scale
+@pytree
+class Classifier:
+    """A detector that learns from labelled windows, and from windows that show nothing.
+
+    Its network outputs the logits of the labels, and last the log-odds that the PoI is there.
+
+    Attributes:
+      params: of its network.
+      offset: `[F]` mean of the windows for training.
+      scale: `[]` overall standard deviation of these windows.
+      threshold: see `Detector`; minus infinity before the training.
+      measures_distance: whether the readings are distances in metres; the network then also reads
+        how far they are from the expected distance.
+      hidden: sizes of the hidden layers.
+      num_labels: D_m.
+    """
+
+    params: Params
+    offset: Float[Array, " F"]
+    scale: Float[Array, ""]
+    threshold: Float[Array, ""]
+    measures_distance: bool = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+    num_labels: int = struct.field(pytree_node=False)
+
+    @property
+    def window_size(self) -> int:
+        """F."""
+        return len(self.offset)
+
+    @property
+    def network(self) -> MLP:
+        """From what it reads in a look to its logits."""
+        return MLP(self.hidden, self.num_labels + 1)
+
+    def logits(
+        self, window: Float[Array, "F *B"], distance: Float[Array, "*B"]
+    ) -> Float[Array, "D_m+1 *B"]:
+        """See `Detector.logits`; also for looks in columns."""
+        read = [(window - self.offset.reshape(-1, *[1] * distance.ndim)) / self.scale]
+        if self.measures_distance:
+            off = (window - distance[None]) / _DEPTH
+            read.append(jnp.clip(off, -_MAX_DEPTHS, _MAX_DEPTHS))
+        read.append(jnp.stack([distance, 1 / distance]))
+        return networks.apply(self.network, self.params, jnp.concatenate(read))
+
+    def of(self, looks: Looks) -> Float[Array, "D_m+1 S"]:
+        """Logits of many looks."""
+        return self.logits(looks.windows.T, looks.distances)
+
+
+def init(
+    key: Key,
+    windows: Float[Array, "S F"],
+    num_labels: int,
+    config: DetectorConfig,
+    measures_distance: bool = False,
+) -> Classifier:
+    """Untrained detector, whose input is standardised by `windows` for training."""
+    checks.require_shape("windows", windows, (None, None))
+    offset, scale = networks.statistics(windows)
+    numbers = (1 + measures_distance) * len(offset) + 2
+    params = networks.init(key, MLP(config.hidden, num_labels + 1), numbers)
+    threshold = jnp.float32(-jnp.inf)
+    return Classifier(
+        params, offset, scale, threshold, measures_distance, config.hidden, num_labels
+    )
 
 
 @pytree
 class Fitting:
-    """Problem of fitting a detector to labelled windows, with the cross-entropy as loss.
+    """Problem of fitting a detector to looks at PoIs and half as many at nothing.
 
     Attributes:
-      config: batch, learning rate and steps.
+      config: batch, of looks at PoIs, learning rate and steps.
       detector: from `init`.
-      windows: `[S, F]` windows of simulated scans.
-      labels: `[S]` int32 true labels.
+      shown: looks at PoIs.
+      labels: `[S]` int32 their labels.
+      nothing: looks that show no PoI.
     """
 
     config: DetectorConfig
     detector: Classifier
-    windows: Float[Array, "S F"]
+    shown: Looks
     labels: Int[Array, " S"]
+    nothing: Looks
 
-    def draw(self, key: Key, number: int) -> Int[Array, "{number} B"]:
-        """Draws rows of the windows.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
-        shape = number, self.config.batch
-        return jax.random.randint(key, shape, 0, self.windows.shape[0])
+    def draw(self, key: Key, number: int) -> tuple[Int[Array, "_ B"], Int[Array, "_ B/2"]]:
+        """Rows of the looks at PoIs, and of those at nothing, see `Problem.draw`."""
+        shown_key, nothing_key = jax.random.split(key)
+        batch = self.config.batch
+        shown = jax.random.randint(shown_key, (number, batch), 0, len(self.labels))
+        shape = number, -(-batch // 2)
+        return shown, jax.random.randint(nothing_key, shape, 0, len(self.nothing.distances))
 
     def loss(
-        self, params: Params, drawn: Int[Array, " B"], step: Int[Array, ""]
+        self, params: Params, drawn: tuple[Int[Array, " B"], Int[Array, " B/2"]], step: Array
     ) -> Float[Array, ""]:
-        """Mean cross-entropy of a batch.
-
-        Args:
-          params: of the network.
-          drawn: `[B]` rows of the windows.
-          step: not used.
-        """
+        """Mean cross-entropy of looks at PoIs, plus that of looks at nothing."""
         del step
-        detector = self.detector
-        standard = (self.windows[drawn] - detector.offset[None]) / detector.scale
-        predicted = networks.apply(_network(detector), params, standard.T)
-        cross_entropy = optax.softmax_cross_entropy_with_integer_labels
-        return cross_entropy(predicted, self.labels[drawn], 0).mean()
+        detector, (shown, nothing) = dataclasses.replace(self.detector, params=params), drawn
+        looks = jax.tree.map(
+            lambda x, y: jnp.concatenate([x[shown], y[nothing]]), self.shown, self.nothing
+        )
+        labels = jnp.pad(self.labels[shown], (0, len(nothing)), constant_values=-1)
+        found = log_probabilities(detector.of(looks))
+        cost = -jnp.take_along_axis(found, labels[None], axis=0)[0]
+        return cost[: len(shown)].mean() + cost[len(shown) :].mean()
+
+
+def fitted(detector: Classifier, shown: Looks, nothing: Looks) -> Classifier:
+    """Sets the threshold and calibrates the odds with looks that training did not use.
+
+    The threshold loses 1 % of the looks at PoIs, or fewer if that already rejects 99.8 % of those
+    at nothing. Both kinds of looks count equally.
+    """
+    of_shown, of_nothing = detector.of(shown)[-1], detector.of(nothing)[-1]
+
+    def loss(factor: Float[Array, ""]) -> Float[Array, ""]:
+        lost, passed = (jax.nn.softplus(x) for x in (-factor * of_shown, factor * of_nothing))
+        return lost.mean() + passed.mean()
+
+    factor = _best_factor(loss)
+    most, enough = jnp.quantile(of_shown, _MAX_LOST), jnp.quantile(of_nothing, 1 - _MAX_PASSED)
+    scaled = _scaled(detector, jnp.ones(detector.num_labels + 1).at[-1].set(factor))
+    return dataclasses.replace(scaled, threshold=factor * jnp.minimum(most, enough))
+
+
+def calibrate(detector: Classifier, shown: Looks, labels: Int[Array, " S"]) -> Classifier:
+    """Divides the labels' logits by the best temperature for looks that training did not use."""
+    checks.require_shape("labels", labels, (len(shown.distances),))
+    best = sharpness(detector.of(shown)[:-1], labels)
+    return _scaled(detector, jnp.full(detector.num_labels + 1, best).at[-1].set(1.0))
+
+
+def _scaled(detector: Classifier, factors: Float[Array, " D_m+1"]) -> Classifier:
+    """The detector with scaled outputs of its network."""
+    params = networks.scale_last(detector.network, detector.params, factors)
+    return dataclasses.replace(detector, params=params)
 
 
 RETRAINING = DetectorConfig(steps=600, batch=64, learning_rate=3e-4, calibration=0.25)
@@ -242,80 +300,128 @@ RETRAINING = DetectorConfig(steps=600, batch=64, learning_rate=3e-4, calibration
 def retrain(
     key: Key,
     detector: Classifier,
-    windows: Float[Array, "S F"],
+    shown: Looks,
     labels: Int[Array, " S"],
     config: DetectorConfig = RETRAINING,
 ) -> Classifier:
-    """Fine-tunes a detector on other windows, for example 200 recorded ones.
+    """Fine-tunes how a detector tells labels apart on other looks, for example 200 recorded ones.
 
-    Few windows may replace what many have taught. So the parameters move from the old ones towards
-    the new ones (as in Wortsman et al. 2022) as far as that helps with windows kept from training.
+    Few looks may replace what many have taught. So only the labels' outputs are trained, and move
+    from the old parameters towards the new ones (as in Wortsman et al. 2022) as far as that helps
+    with looks kept from training.
 
     Args:
       key: random key.
       detector: a trained detector.
-      windows: `[S, F]` windows that show PoIs, see `sim.cut_out`, in random order.
+      shown: looks at PoIs, see `sim.cut_out`, in random order.
       labels: `[S]` int32 their labels.
-      config: batch, learning rate, steps, and the share of windows to keep, `calibration`; static.
+      config: batch, learning rate, steps, and the share of looks to keep, `calibration`; static.
 
     Returns:
-      The detector with other parameters; its gate is the same. Inside `jit`, which raises no error,
-      all parameters are NaN if the training or its windows are not finite.
+      The detector with other parameters, and the same log-odds that a PoI is there. Inside `jit`,
+      which raises no error, the parameters are NaN if the training or its looks are not finite.
 
     Raises:
       TypeError: if the detector is an encoder of scans, which learns without labels.
       ValueError: if windows are not finite, a label is none of the detector's, the training
-        diverges, or `config.calibration` leaves no window to train with, or none to judge by.
+        diverges, or `config.calibration` leaves no look to train with, or none to judge by.
     """
     checks.require_key(key)
     if not isinstance(detector, Classifier):
         kind = type(detector).__name__
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
-    windows, labels = jnp.asarray(windows), jnp.asarray(labels)
-    checks.require_shape("windows", windows, (None, len(detector.offset)))
-    checks.require_finite("windows", windows, "must be finite; leave out what was not recorded")
-    checks.require_shape("labels", labels, (len(windows),))
+    shown, labels = jax.tree.map(jnp.asarray, (shown, labels))
+    checks.require_shape("windows", shown.windows, (None, detector.window_size))
+    checks.require_finite("windows", shown.windows, "must be finite; leave out what has gaps")
+    checks.require_shape("labels", labels, (len(shown.windows),))
+    checks.require_shape("distances", shown.distances, labels.shape)
     checks.require_index("labels", labels, detector.num_labels)
     number = config.num_training(len(labels))
     if not 0 < number < len(labels):
-        expected = f"must leave some of {len(labels)} windows to train with, and some to judge by"
+        expected = f"must leave some of {len(labels)} looks to train with, and some to judge by"
         raise ValueError(f"config.calibration = {config.calibration}: {expected}")
-    problem = Fitting(config, detector, windows[:number], labels[:number])
+    problem = Relabelling(config, detector, shown, labels, number)
     fit, _ = supervised.fit(key, supervised.start(detector.params, config), problem, config.steps)
-    kept = jnp.arange(number, len(labels))
-    judge = Fitting(config, detector, windows, labels)
 
     def moved(share: jax.Array) -> Params:
         return jax.tree.map(lambda old, new: old + share * (new - old), detector.params, fit.params)
 
-    shares = jnp.linspace(0.0, 1.0, 21)
-    losses = jax.lax.map(lambda share: judge.loss(moved(share), kept, fit.step), shares)
+    kept, shares = jnp.arange(number, len(labels)), jnp.linspace(0.0, 1.0, 21)
+    losses = jax.lax.map(lambda share: problem.loss(moved(share), kept, fit.step), shares)
     checks.require_finite("loss of retrained detectors", losses, "must be finite; retrain slower")
     best = jnp.where(jnp.isfinite(losses).all(), shares[jnp.argmin(losses)], jnp.nan)
     return dataclasses.replace(detector, params=moved(best))
 
 
-def calibrate(
-    detector: Classifier, windows: Float[Array, "S F"], labels: Int[Array, " S"]
-) -> Classifier:
-    """Divides logits by the best temperature for other looks (Guo et al. 2017, Sec. 4.2).
+@pytree
+class Relabelling:
+    """Problem of fitting the labels' outputs of a trained detector, see `retrain`."""
 
-    Args:
-      detector: a trained detector.
-      windows: `[S, F]` that the detector was not trained on.
-      labels: `[S]` int32 true labels.
+    config: DetectorConfig
+    detector: Classifier
+    shown: Looks
+    labels: Int[Array, " S"]
+    number: int = struct.field(pytree_node=False)
 
-    Returns:
-      The detector whose probabilities make these labels most likely.
+    def draw(self, key: Key, number: int) -> Int[Array, "{number} B"]:
+        """Rows of the looks to train with, see `Problem.draw`."""
+        return jax.random.randint(key, (number, self.config.batch), 0, self.number)
+
+    def loss(self, params: Params, drawn: Int[Array, " B"], step: Array) -> Float[Array, ""]:
+        """Mean cross-entropy of the labels, whose gradient moves the last layer alone."""
+        del step
+        last = f"Dense_{len(self.detector.hidden)}"
+        layers = {**jax.lax.stop_gradient(params["params"]), last: params["params"][last]}
+        detector = dataclasses.replace(self.detector, params={"params": layers})
+        found = detector.of(jax.tree.map(lambda x: x[drawn], self.shown))[:-1]
+        cross_entropy = optax.softmax_cross_entropy_with_integer_labels
+        return cross_entropy(found, self.labels[drawn], 0).mean()
+
+
+def sharpness(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Array, ""]:
+    """The factor on logits by which the labels are the most likely.
+
+    Its inverse is the temperature of Guo et al. 2017, Sec. 4.2.
     """
-    checks.require_shape("labels", labels, (len(windows),))
-    standard = (windows - detector.offset[None]) / detector.scale
-    predicted = networks.apply(_network(detector), detector.params, standard.T)
-    best = calibration.sharpness(predicted, labels)
-    params = networks.scale_last(_network(detector), detector.params, best)
-    return dataclasses.replace(detector, params=params)
+    cross_entropy = optax.softmax_cross_entropy_with_integer_labels
+    return _best_factor(lambda factor: cross_entropy(factor * logits, labels, 0).mean())
 
 
-def _network(detector: Classifier) -> MLP:
-    """The network of a detector."""
-    return MLP(detector.hidden, detector.num_labels)
+def _best_factor(loss: Callable[[Float[Array, ""]], Float[Array, ""]]) -> Float[Array, ""]:
+    """The factor of the lowest loss, of 513 from 1/16 to 16."""
+    return jnp.asarray(_FACTORS)[jnp.argmin(jax.lax.map(loss, jnp.asarray(_FACTORS)))]
+
+
+def negative_log_likelihood(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Mean of `-log p(label)` in nats."""
+    checks.require_shape("probabilities", probabilities, (None, None))
+    checks.require_shape("labels", labels, (len(probabilities),))
+    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+    return -jnp.mean(jnp.log(jnp.maximum(right, 1e-12)))
+
+
+def calibration_error(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Expected calibration error of the most likely labels (Guo et al. 2017, Sec. 2).
+
+    The difference between mean confidence and accuracy in a bin of `reliability`, averaged over
+    all looks.
+    """
+    found = reliability(probabilities, labels)
+    share = found.looks / len(labels)
+    return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
+
+
+def reliability(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
+    """Points of a reliability diagram with fifteen bins of equal width."""
+    checks.require_shape("probabilities", probabilities, (None, None))
+    checks.require_shape("labels", labels, (len(probabilities),))
+    confidence = jnp.max(probabilities, axis=1)
+    is_right = jnp.argmax(probabilities, axis=1) == labels
+    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
+    of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
+    sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
+    return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])

@@ -36,8 +36,8 @@ class Filter:
     """Fusion by a learned Bayes filter, which accumulates looks in the belief.
 
     Attributes:
-      networks: by modality, parameters of the network that maps features to K coefficients of the
-        classes' moments in the log-likelihood, see `log_likelihood`.
+      networks: for each modality, from features to K coefficients of the classes' moments in the
+        log-likelihood.
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
       readout: reads class probabilities from beliefs.
@@ -65,14 +65,7 @@ class Filter:
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look.
-
-        Args:
-          belief: `[D]` before the look.
-          seen: not used.
-          features: `[D_m]` probabilities of the labels.
-          modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+        """Belief after one more look, see `Fusion.update`; `seen` is not used.
 
         Raises:
           ValueError: if there is no such modality, `features` are not probabilities, the belief is
@@ -91,7 +84,7 @@ class Filter:
         return readout.mixture(self.classes, jax.nn.softmax(before + weight * found))
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
-        """Belief after looks by several sensors, `[D_m]` features by modality."""
+        """See `Fusion.together`."""
         checks.require_type("looks", looks, Mapping, "from modalities to features")
         belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
         for modality, features in looks.items():
@@ -101,17 +94,12 @@ class Filter:
     def log_likelihood(
         self, params: dict[str, Params], features: Float[Array, "D_m *B"], modality: int
     ) -> Float[Array, "C *B"]:
-        """Log-likelihood of each class given one look, up to a constant.
-
-        It is linear in the whitened moments of the classes, see `Readout`.
+        """Log-likelihood of each class given one look, linear in the classes' whitened moments.
 
         Args:
           params: of the networks, by modality.
           features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
           modality: index of the sensor; static.
-
-        Returns:
-          `[C]`, or `[C, B]`.
         """
         moments = self.readout.of_classes
         network = MLP(self.hidden, moments.shape[1])
@@ -129,19 +117,9 @@ class Filter:
 
 
 def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
-    """Untrained filter, which looks do not update.
-
-    Args:
-      key: random key.
-      model: shape of the JMVAE.
-      classes: `[C, D]` mean joint posterior of each class.
-      prior: `[D]` belief before any look.
-      config: sizes of the networks.
-    """
+    """Untrained filter, which looks do not update; see `Filter`."""
     checks.require_shape("classes.mean", classes.mean, (None, model.latent_size))
-    checks.require_shape("classes.std", classes.std, classes.mean.shape)
     checks.require_shape("prior.mean", prior.mean, (model.latent_size,))
-    checks.require_shape("prior.std", prior.std, (model.latent_size,))
     read = readout.make(classes, readout.directions(model.feature_sizes))
     network = MLP(config.hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))
@@ -151,37 +129,19 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
         name: networks.scale_last(network, networks.init(k, network, size), 0.0)
         for k, name, size in of_each
     }
-    return Filter(
-        networks=silent,
-        classes=classes,
-        prior=prior,
-        readout=read,
-        model=model,
-        hidden=config.hidden,
-    )
+    return Filter(silent, classes, prior, read, model, config.hidden)
 
 
 @pytree
 class Fitting:
-    """Problem of fitting a filter's networks to random histories of looks.
-
-    Attributes:
-      config: looks per history, batch, learning rate and steps.
-      filter: from `init`.
-      bank: features to draw looks from.
-    """
+    """Problem of fitting a filter's networks to random histories of looks from a bank."""
 
     config: FilterConfig
     filter: Filter
     bank: Samples
 
     def draw(self, key: Key, number: int) -> Drawn:
-        """Draws histories of looks.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
+        """Histories of looks, see `Problem.draw`."""
         bank, shape = self.bank, (number, self.config.looks, self.config.batch)
         class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
         classes = jax.random.randint(class_key, (number, self.config.batch), 0, len(bank[0]))
@@ -195,13 +155,7 @@ class Fitting:
     def loss(
         self, params: dict[str, Params], drawn: Drawn, step: Int[Array, ""]
     ) -> Float[Array, ""]:
-        """Mean divergence from the joint posterior of the true class to the beliefs.
-
-        Args:
-          params: of the networks, by modality.
-          drawn: one step of `draw`.
-          step: not used.
-        """
+        """Mean divergence from the joint posterior of the true class to the beliefs."""
         del step
         true_class, sensor, looks = drawn
         number, classes = len(self.bank), self.filter.classes
@@ -214,14 +168,7 @@ class Fitting:
         added = jnp.sum(jnp.where(is_used, found, 0.0), axis=0)
         probabilities = jax.nn.softmax(jnp.cumsum(added, axis=1), axis=0)
         mix = jax.vmap(jax.vmap(lambda p: readout.mixture(classes, p), -1, -1), -1, -1)
-        truth = jax.tree.map(lambda x: x[true_class].T[:, None], classes)
-        return jnp.mean(_divergence(truth, mix(probabilities)))
-
-
-def _divergence(truth: Belief, beliefs: Belief) -> jax.Array:
-    """`[T, B]` `KL(truth || belief)` of `[D, 1, B]` and `[D, T, B]` Gaussians."""
-    shape = beliefs.mean.shape
-    parts = (truth.mean, 2 * jnp.log(truth.std), beliefs.mean, 2 * jnp.log(beliefs.std))
-    mean_p, log_var_p, mean_q, log_var_q = (jnp.broadcast_to(part, shape) for part in parts)
-    divergence = jax.vmap(jax.vmap(gaussian.kl_divergence, -1, -1), -1, -1)
-    return divergence(mean_p, log_var_p, mean_q, log_var_q)
+        truth = jax.tree.map(lambda x: x[true_class].T[:, None], classes)  # [D, 1, B]
+        beliefs = mix(probabilities)  # [D, T, B]
+        p, q = ((x.mean, 2 * jnp.log(x.std)) for x in (truth, beliefs))
+        return jnp.mean(gaussian.kl_divergence(*p, *q))

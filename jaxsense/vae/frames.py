@@ -30,11 +30,7 @@ class Frame(Protocol):
     """How a network sees the windows of one sensor; a frozen pytree."""
 
     def __call__(self, window: Float[Array, " F"]) -> Float[Array, " G"]:
-        """The numbers that the network reads.
-
-        Args:
-          window: `[F]` readings around the PoI's bearing, see `sim.windows.as_window`.
-        """
+        """The numbers that the network reads in a window, see `sim.windows.as_window`."""
         ...
 
 
@@ -118,7 +114,7 @@ def make(
     Args:
       angles: `[W]` of the rays in the middle of its view, in radians.
       channels: numbers in the reading of one ray.
-      measures_distance: whether readings are distances in metres.
+      measures_distance: as in `Sensor`.
       extent: radius of the circle that holds a PoI, in metres.
       bearing_error: largest error of the window's middle, in radians.
     """
@@ -132,13 +128,7 @@ def make(
 
 @pytree
 class Scaling:
-    """Numbers in a frame, standardised by those of a training.
-
-    Attributes:
-      frame: of the sensor.
-      offset: `[G]` mean of the training's.
-      scale: `[]` their overall standard deviation.
-    """
+    """Numbers in a frame, less the `[G]` mean of a training's, in their standard deviation."""
 
     frame: Frame
     offset: Float[Array, " G"]
@@ -150,12 +140,7 @@ class Scaling:
 
 
 def scaled(frame: Frame, windows: Float[Array, "S F"]) -> tuple[Scaling, Float[Array, "S G"]]:
-    """Standardises a frame by windows for training, which it also returns in this frame.
-
-    Args:
-      frame: of the sensor.
-      windows: `[S, F]`.
-    """
+    """Standardises a frame by `[S, F]` windows, which it also returns in this frame."""
     seen = jax.lax.map(frame, windows, batch_size=min(4096, len(windows)))
     offset, scale = networks.statistics(seen)
     return Scaling(frame, offset, scale), (seen - offset[None]) / scale

@@ -1,8 +1,4 @@
-"""Fusion in place, the paper's.
-
-Korthals et al. 2018, Sec. III and Fig. 3. `vae.filter` holds another kind of fusion. A custom
-fusion is a class with the attributes and methods of `core.types.Fusion`.
-"""
+"""Fusion in place, the paper's (Korthals et al. 2018, Sec. III and Fig. 3); see also `filter`."""
 
 import itertools
 from collections.abc import Mapping
@@ -27,14 +23,7 @@ class InPlace:
     """The paper's fusion: a look replaces the belief.
 
     The map does not keep features of earlier looks. Those of the other modalities are decoded from
-    the mean of the belief, and encoded together with the new ones.
-
-    Attributes:
-      params: of the JMVAE.
-      classes: `[C, D]` mean joint posterior of each class.
-      prior: `[D]` belief before any look.
-      readout: reads class probabilities from beliefs.
-      model: shape of the JMVAE.
+    the mean of the belief, and encoded together with the new ones. For the attributes see `Filter`.
     """
 
     params: Params
@@ -56,14 +45,7 @@ class InPlace:
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look, see `fuse`.
-
-        Args:
-          belief: `[D]` before the look.
-          seen: `[M]` bool, which modalities have looked before.
-          features: `[D_m]` probabilities of the labels.
-          modality: index of the sensor; static.
-          weight: not used: a look replaces the one before.
+        """Belief after one more look, see `Fusion.update` and `fuse`; `weight` is not used.
 
         Raises:
           ValueError: if there is no such modality; see also `fuse`.
@@ -75,7 +57,7 @@ class InPlace:
         return fuse(self.params, self.model, belief, seen, of_all)
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
-        """Posterior `q(z|x)` given looks by several sensors, `[D_m]` features by modality."""
+        """Posterior `q(z|x)`, see `Fusion.together`."""
         for modality in looks:
             checks.require_modality(modality, self.model.modalities)
         features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
@@ -142,12 +124,6 @@ class Decoding:
 
     The JMVAE decodes draws from `q(z|all)`, few of which lie near the mean of `q(z|s)` for a subset
     s of the modalities. The encoders stay as they are.
-
-    Attributes:
-      config: weights, batch, learning rate and steps.
-      params: of the JMVAE.
-      bank: features to draw from.
-      model: shape of the JMVAE.
     """
 
     config: JmvaeConfig
@@ -156,22 +132,11 @@ class Decoding:
     model: Jmvae = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> jmvae.Drawn:
-        """Draws features from the bank, see `jmvae.Fitting`.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
+        """Features from the bank, see `jmvae.Fitting`."""
         return jmvae.Fitting(self.config, self.bank, self.model).draw(key, number)
 
     def loss(self, params: Params, drawn: jmvae.Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2` over a batch.
-
-        Args:
-          params: of the decoders, by modality.
-          drawn: one step of `draw`.
-          step: not used.
-        """
+        """Mean of `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2` over a batch."""
         del step
         _, features = drawn
         whole, weights = {**self.params, "decoders": params}, self.config.reconstruction_weights
@@ -193,15 +158,7 @@ class Decoding:
 def train_decoders(
     key: Key, params: Params, model: Jmvae, bank: Samples, config: JmvaeConfig
 ) -> Params:
-    """Parameters of a JMVAE whose decoders have learned what fusion in place decodes.
-
-    Args:
-      key: random key.
-      params: of the JMVAE.
-      model: its shape.
-      bank: for each modality `[C, S, D_m]` features of looks at every class.
-      config: weights, batch, learning rate and number of steps.
-    """
+    """Parameters of a JMVAE whose decoders have learned what fusion in place decodes."""
     state = supervised.start(params["decoders"], config)
     state, _ = supervised.fit(key, state, Decoding(config, params, bank, model), config.steps)
     return {**params, "decoders": state.params}
@@ -209,15 +166,7 @@ def train_decoders(
 
 @checks.typed
 def prior(model: Jmvae, variance: float) -> Belief:
-    """Makes the belief before any look, with mean 0.
-
-    Args:
-      model: shape of the JMVAE.
-      variance: of each latent dimension.
-
-    Raises:
-      ValueError: if the variance is not positive.
-    """
+    """The belief before any look, with mean 0 and the `variance` in each latent dimension."""
     checks.require_positive("variance", variance)
     return Belief(
         jnp.zeros(model.latent_size), jnp.full(model.latent_size, jnp.sqrt(jnp.float32(variance)))

@@ -2,8 +2,7 @@
 
 Suzuki, Nakayama and Matsuo 2017, as used in Korthals et al. 2018, Sec. II. Every non-empty subset
 of the modalities has an encoder, or only subsets up to a size and the full set. The encoder of the
-full set is the joint encoder; a Kullback-Leibler divergence draws every other encoder to it. With
-two modalities these are the joint encoder and the two uni-modal encoders of the paper.
+full set is the joint encoder, to which a Kullback-Leibler divergence draws every other.
 """
 
 import dataclasses
@@ -36,9 +35,8 @@ class Jmvae:
       feature_sizes: D_m of each modality.
       latent_size: D.
       hidden: sizes of the hidden layers of every encoder and decoder.
-      max_subset: number of modalities up to which subsets have encoders, next to the full set; by
-        default every subset has one, which six modalities make 63. The posterior of another subset
-        is the product of those of its modalities.
+      max_subset: largest subset with an encoder, next to the full set; all by default. The
+        posterior of another subset is the product of those of its modalities.
     """
 
     modalities: tuple[str, ...]
@@ -79,12 +77,9 @@ class Jmvae:
 
 
 def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
-    """Initialises parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
+    """Random parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
 
-    Args:
-      key: random key.
-      model: the shape.
-      scale: factor on all weights. With 0.6, features of hundreds of numbers need far fewer steps.
+    With a `scale` of 0.6 on all weights, features of hundreds of numbers need far fewer steps.
     """
     checks.require_key(key)
     checks.require_positive("scale", scale)
@@ -113,18 +108,12 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
 def encode(
     params: Params, model: Jmvae, features: Features
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """Encodes features into mean and log-variance of the posterior `q(z | present features)`.
-
-    Of a subset without an encoder it is the product of the posteriors of its modalities, in which
-    their prior N(0, I) counts once.
+    """`[D]` mean and log-variance of the posterior `q(z | present features)`.
 
     Args:
       params: from `init` or `train`.
       model: the shape.
       features: for each modality `[D_m]`, or None where it is missing.
-
-    Returns:
-      `[D]` mean and `[D]` log-variance.
 
     Raises:
       ValueError: if `features` has another length than `model.modalities`, all are None, or one is
@@ -151,16 +140,7 @@ def _encode(
 
 @checks.typed
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
-    """Decodes a latent into the mean of `p(features | z)` for every modality.
-
-    Args:
-      params: from `init` or `train`.
-      model: the shape.
-      z: `[D]` latents.
-
-    Returns:
-      For each modality `[D_m]`.
-    """
+    """Mean of `p(features | z)`, `[D_m]` for each modality, for a `[D]` latent."""
     checks.require_shape("z", z, (model.latent_size,))
     return _decode(params, model, z)
 
@@ -175,13 +155,7 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
 
 @checks.typed
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
-    """Encodes features into a belief, the posterior `q(z | present features)`; see `encode`.
-
-    Args:
-      params: from `init` or `train`.
-      model: the shape.
-      features: for each modality `[D_m]`, or None where it is missing.
-    """
+    """The posterior `q(z | present features)` as a belief, see `encode`."""
     mean, log_var = encode(params, model, features)
     return Belief(mean, jnp.exp(0.5 * log_var))
 
@@ -205,7 +179,7 @@ def loss(
     same as a variance of 1 / w_m.
 
     Args:
-      key: random key of the draw.
+      key: of the draw.
       params: from `init`.
       model: the shape.
       features: `[D_m]` of every modality.
@@ -247,7 +221,7 @@ def losses(
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
 ) -> tuple[Float[Array, " B"], dict[str, Float[Array, " B"]]]:
-    """Losses of a batch, which is the last axis of all arrays.
+    """Losses and their parts of a batch, the last axis of all arrays; see `loss`.
 
     Args:
       noise: `[D, B]` standard normal draws, for z.
@@ -257,12 +231,6 @@ def losses(
       alpha: see `loss`.
       beta: see `loss`.
       reconstruction_weights: see `loss`.
-
-    Returns:
-      `[B]` losses and their `[B]` parts, see `loss`.
-
-    Raises:
-      ValueError: if a modality's weight is missing.
     """
     checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     batch = noise.shape[-1]
@@ -275,11 +243,10 @@ def losses(
     reconstruction = jnp.zeros(batch)
     for x, decoded_mean, weight in zip(features, decoded, reconstruction_weights, strict=True):
         reconstruction += weight * 0.5 * jnp.sum((x - decoded_mean) ** 2, axis=0)
-    prior = jax.vmap(gaussian.kl_to_standard_normal, in_axes=-1)(mean, log_var)
-    divergence, subsets = jax.vmap(gaussian.kl_divergence, in_axes=-1), jnp.zeros(batch)
+    prior, subsets = gaussian.kl_divergence(mean, log_var), jnp.zeros(batch)
     for subset in others:
-        subset_mean, subset_log_var = _encode(params, model, subset, features)
-        subsets += divergence(mean, log_var, subset_mean, subset_log_var)
+        of_subset = _encode(params, model, subset, features)
+        subsets += gaussian.kl_divergence(mean, log_var, *of_subset)
     parts = {"reconstruction": reconstruction, "prior": prior, "subsets": subsets}
     return reconstruction + beta * prior + alpha * subsets, parts
 
@@ -289,11 +256,6 @@ class Fitting:
     """Problem of fitting a JMVAE to features.
 
     A training example is one look by each modality at the same class, independent given the class.
-
-    Attributes:
-      config: weights, batch, learning rate and steps.
-      bank: features to draw from.
-      model: shape of the JMVAE.
     """
 
     config: JmvaeConfig
@@ -301,12 +263,7 @@ class Fitting:
     model: Jmvae = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> Drawn:
-        """Draws noise, and features from the bank.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
+        """Noise, and features from the bank, see `Problem.draw`."""
         shape = number, self.config.batch
         columns = [jnp.moveaxis(x, -1, 0) for x in self.bank]
         class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(columns))
@@ -319,13 +276,7 @@ class Fitting:
         return noise, tuple(features)
 
     def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses` of a batch.
-
-        Args:
-          params: of the JMVAE.
-          drawn: one step of `draw`.
-          step: `[]` int32, which determines beta.
-        """
+        """Mean of the `losses` of a batch; the step determines beta."""
         noise, features = drawn
         total, _ = losses(
             noise,
@@ -352,8 +303,7 @@ def train(
         by every modality at one class. Rows that belong together, such as views of one object, are
         classes with a look each: `[N, 1, D_m]`.
       config: weights, batch, learning rate and number of steps; the other settings are not used.
-        A modality's decoder is a Gaussian whose variance is one over its reconstruction weight, so
-        with `beta` 1 and `annealing` 0 the loss is the negative bound of Suzuki et al. 2017, up to
+        With `beta` 1 and `annealing` 0 the loss is the negative bound of Suzuki et al. 2017, up to
         a constant.
 
     Returns:
@@ -362,7 +312,7 @@ def train(
 
     Raises:
       ValueError: if a modality has no features, or some of another shape or not finite, or if the
-        loss diverges; `jit` checks shapes alone.
+        loss diverges.
       ConfigError: in JAX's 64-bit mode.
     """
     checks.require_key(key)
@@ -384,17 +334,60 @@ def train(
 
 
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:
-    """Beta at a gradient step: it falls from `initial_beta` to `beta` exponentially, then stays.
+    """Beta at a gradient step: exponential decay from `initial_beta` to `beta`, then constant.
 
-    A beta that falls from a high value lets each latent dimension come into use once it explains
-    enough of the features. With a low beta from the start, all classes may end up on one line, a
-    local optimum that leaves the other dimensions empty.
-
-    Args:
-      step: `[]` int32.
-      config: `beta`, `initial_beta`, `annealing` and `steps`.
+    With a low beta from the start, all classes may end up on one line, a local optimum that leaves
+    the other latent dimensions empty.
     """
     # With `annealing` = 0, beta is constant.
     annealing_steps = jnp.maximum(config.annealing * config.steps, 1e-6)
     remaining = jnp.where(config.annealing > 0, jnp.maximum(1.0 - step / annealing_steps, 0.0), 0.0)
     return config.beta * (config.initial_beta / config.beta) ** remaining
+
+
+def log_likelihood(
+    key: Key,
+    params: Params,
+    model: Jmvae,
+    features: Features,
+    reconstruction_weights: Float[Array, " M"] | tuple[float, ...],
+    samples: int = 200,
+) -> Float[Array, ""]:
+    """Estimate of `log p(present features)` in nats, by importance sampling with their posterior.
+
+    Burda, Grosse and Salakhutdinov 2016, Eq. 8. On average the estimate is too low; more samples
+    bring it closer. For the likelihood of features given others, subtract that of the others.
+
+    Args:
+      key: random key.
+      params: from `train`.
+      model: the shape.
+      features: for each modality `[D_m]`, or None where it is missing.
+      reconstruction_weights: of the training, the inverse variance of each modality's features
+        given the latents.
+      samples: number of latents to draw; static.
+    """
+    checks.require_key(key)
+    checks.require_number("samples", samples)
+    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
+    given = tuple(reconstruction_weights)
+    checks.require_positive("reconstruction_weights", jnp.stack(given))
+    belief = posterior(params, model, features)
+
+    def log_weight(noise: Float[Array, " D"]) -> Float[Array, ""]:
+        z = belief.mean + belief.std * noise
+        decoded = decode(params, model, z)
+        of_features = sum(
+            _log_normal((x - mean) * jnp.sqrt(weight)) + 0.5 * x.shape[-1] * jnp.log(weight)
+            for x, mean, weight in zip(features, decoded, given, strict=True)
+            if x is not None
+        )
+        return of_features + _log_normal(z) - _log_normal(noise) + jnp.sum(jnp.log(belief.std))
+
+    noise = jax.random.normal(key, (samples, model.latent_size))
+    return jax.nn.logsumexp(jax.vmap(log_weight)(noise)) - jnp.log(samples)
+
+
+def _log_normal(x: Float[Array, " D"]) -> Float[Array, ""]:
+    """Log density of independent standard normals."""
+    return -0.5 * jnp.sum(x**2 + jnp.log(2 * jnp.pi))

@@ -19,17 +19,18 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import JmvaeConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.vae import calibration, gaussian
+from jaxsense.core.types import Belief, Key, product, pytree
+from jaxsense.vae import detectors, gaussian
+from jaxsense.vae.detectors import Classifier
 from jaxsense.vae.frames import Scaling
-from jaxsense.vae.gate import Gate
 from jaxsense.vae.jmvae import annealed_beta
 from jaxsense.vae.readout import Readout
 
 _EMBEDDING = 64  # numbers that a network finds in a look
-_FIRST_ALPHA = 0.1  # before alpha sets in, posteriors of few looks follow and do not draw
+_FIRST_ALPHA = 0.1  # weight of divergences before alpha sets in, with a fixed joint posterior
 _ALPHA_RAMP = 0.2  # of the training
 _LOG_VARIANCES = -10.0, 6.0
+_TRIES, _MOVES = 16, 30  # of k-means
 
 Drawn = tuple[jax.Array, jax.Array]
 """Rows `[steps, B]`, and noise `[steps, M, D, B, K]`."""
@@ -75,12 +76,7 @@ class Shape:
 
 
 def init(key: Key, shape: Shape) -> Params:
-    """Random parameters, `{"encoders": {NAME: ...}, "embeddings", "decoders", "joint"}`.
-
-    Args:
-      key: random key.
-      shape: sizes of the networks.
-    """
+    """Random parameters, `{"encoders": {NAME: ...}, "embeddings", "decoders", "joint"}`."""
     joint_key, *keys = jax.random.split(key, 1 + 3 * len(shape.inputs))
     each = list(zip(shape.modalities, shape.inputs, strict=True))
     parts = {"encoders": shape.encoder, "embeddings": shape.embedding}
@@ -98,13 +94,7 @@ def init(key: Key, shape: Shape) -> Params:
 
 
 def posterior(params: Params, shape: Shape, looks: tuple[Float[Array, "K _"], ...]) -> Belief:
-    """Posterior `q(z | all looks)` at one PoI.
-
-    Args:
-      params: from `init` or a training.
-      shape: sizes of the networks.
-      looks: for each modality `[K, F_m]` one look or more, in the frame of the sensor.
-    """
+    """Posterior `q(z | all looks)` at one PoI, from `[K, F_m]` looks by each modality."""
     means = [
         jnp.mean(_embed(params, shape, m, x.T), axis=1, keepdims=True) for m, x in enumerate(looks)
     ]
@@ -123,7 +113,7 @@ def losses(
     has_begun: Float[Array, ""] | float,
     reconstruction_weights: tuple[float, ...],
 ) -> Float[Array, " B"]:
-    """Losses of a batch of PoIs, to minimise.
+    """Losses of a batch of PoIs.
 
     For each PoI with looks `x_mk`, `sum_mk -w_m / F_m log p(x_mk | z_mk)` up to a constant, with
     `z_mk` drawn from `q(z | all looks but x_mk)` and p a Gaussian of the variance at which the
@@ -139,8 +129,8 @@ def losses(
       looks: K looks, two or more, by each sensor at each of B PoIs.
       alpha: weight of the divergences to the posteriors of fewer looks.
       beta: weight of the divergences from the prior.
-      has_begun: from 0, where these posteriors follow that of all looks and their divergences do
-        not move it, to 1.
+      has_begun: from 0, where the divergences' gradient to the posterior of all looks is stopped,
+        to 1.
       reconstruction_weights: w_m.
     """
     number = looks[0].shape[1]
@@ -148,13 +138,13 @@ def losses(
     found = [_embed(params, shape, m, x) for m, x in enumerate(columns)]
     means = [x.mean(axis=-1) for x in found]
     mean, log_variance = _joint(params, shape, means)
-    total = beta * _divergence(mean, log_variance, 0.0, 0.0)
+    total = beta * gaussian.kl_divergence(mean, log_variance)
     fixed = jax.lax.stop_gradient((mean, log_variance))
 
     def draws(mean_of_few: jax.Array, log_variance_of_few: jax.Array) -> jax.Array:
         few = mean_of_few, log_variance_of_few
-        drawn = _divergence(mean[..., None], log_variance[..., None], *few)
-        follows = _divergence(fixed[0][..., None], fixed[1][..., None], *few)
+        drawn = gaussian.kl_divergence(mean[..., None], log_variance[..., None], *few)
+        follows = gaussian.kl_divergence(fixed[0][..., None], fixed[1][..., None], *few)
         weighted = has_begun * alpha * drawn + (1 - has_begun) * _FIRST_ALPHA * follows
         return jnp.sum(weighted, axis=-1)
 
@@ -162,9 +152,8 @@ def losses(
         left = (means[m][..., None] * number - found[m]) / (number - 1)
         others = [left if i == m else _each(means[i], number) for i in range(len(columns))]
         mean_of_others, log_variance_of_others = _joint(params, shape, others)
-        total += beta * jnp.mean(
-            _divergence(mean_of_others, log_variance_of_others, 0.0, 0.0), axis=-1
-        )
+        from_prior = gaussian.kl_divergence(mean_of_others, log_variance_of_others)
+        total += beta * jnp.mean(from_prior, axis=-1)
         z = gaussian.sample(noise[m], mean_of_others, log_variance_of_others)
         decoder = params["decoders"][shape.modalities[m]]
         error = jnp.sum((x - _columns(shape.decoder(m), decoder, z)) ** 2, axis=0)
@@ -178,25 +167,14 @@ def losses(
 
 @pytree
 class Fitting:
-    """Problem of fitting the JMVAE to groups of looks.
-
-    Attributes:
-      config: weights, batch, learning rate and steps.
-      groups: looks at PoIs, each sensor's in its frame.
-      shape: sizes of the networks.
-    """
+    """Problem of fitting the JMVAE to groups of looks, each sensor's in its frame."""
 
     config: JmvaeConfig
     groups: Groups
     shape: Shape = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> Drawn:
-        """Draws PoIs and noise.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-        """
+        """PoIs and noise, see `Problem.draw`."""
         row_key, noise_key = jax.random.split(key)
         batch, looks = self.config.batch, self.groups[0].shape[1]
         rows = jax.random.randint(row_key, (number, batch), 0, len(self.groups[0]))
@@ -204,13 +182,7 @@ class Fitting:
         return rows, jax.random.normal(noise_key, size)
 
     def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses` of a batch.
-
-        Args:
-          params: of the networks.
-          drawn: one step of `draw`.
-          step: `[]` int32, which determines alpha and beta.
-        """
+        """Mean of the `losses` of a batch; the step determines alpha and beta."""
         rows, noise = drawn
         share = step / self.config.steps
         has_begun = jnp.clip((share - self.config.alpha_start) / _ALPHA_RAMP, 0.0, 1.0)
@@ -234,7 +206,7 @@ class Encoder:
     Attributes:
       params: of the encoder.
       scaling: the frame in which it sees windows.
-      gate: tells which windows show a PoI.
+      presence: a detector of one label, any PoI.
       classes: `[C, D]` mean joint posterior of each class.
       readout: reads class probabilities from posteriors.
       prior: `[D]` belief before any look.
@@ -245,7 +217,7 @@ class Encoder:
 
     params: Params
     scaling: Scaling
-    gate: Gate
+    presence: Classifier
     classes: Belief
     readout: Readout
     prior: Belief
@@ -255,29 +227,31 @@ class Encoder:
 
     @property
     def num_labels(self) -> int:
-        """D_m, the number of labels."""
+        """D_m."""
         return max(self.label_of_class) + 1
 
-    def posterior(self, window: Float[Array, " F"]) -> Belief:
-        """Posterior `q(z | one look)`.
+    @property
+    def window_size(self) -> int:
+        """F."""
+        return self.presence.window_size
 
-        Args:
-          window: `[F]` readings around the PoI's bearing.
-        """
+    @property
+    def threshold(self) -> Float[Array, ""]:
+        """See `Detector`."""
+        return self.presence.threshold
+
+    def logits(
+        self, window: Float[Array, " F"], distance: Float[Array, ""]
+    ) -> Float[Array, " D_m+1"]:
+        """See `Detector.logits`; labels are read from the posterior of the look."""
+        odds = self.presence.logits(window, distance)[-1:]
+        return jnp.concatenate([self.sharpness * self._of_labels(window), odds])
+
+    def _of_labels(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
         output = networks.apply(self.shape.encoder, self.params, self.scaling(window))
         mean, log_variance = _split(output)
-        return Belief(mean, jnp.exp(0.5 * log_variance))
-
-    def features(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-        """Probabilities of the labels, read from the posterior of the look.
-
-        Args:
-          window: `[F]` readings around the PoI's bearing.
-        """
-        return jax.nn.softmax(self.sharpness * self._log_probabilities(window))
-
-    def _log_probabilities(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-        of_class = self.readout.class_probabilities(self.posterior(window), self.prior)
+        posterior = Belief(mean, jnp.exp(0.5 * log_variance))
+        of_class = self.readout.class_probabilities(posterior, self.prior)
         has_label = jnp.array(self.label_of_class)[:, None] == jnp.arange(self.num_labels)[None]
         return jnp.log(jnp.sum(jnp.where(has_label, of_class[:, None], 0.0), axis=0))
 
@@ -292,9 +266,69 @@ def calibrate(encoder: Encoder, windows: Float[Array, "S F"], classes: Int[Array
       windows: `[S, F]` single looks that nothing was trained on.
       classes: `[S]` int32 what all looks at their PoIs show together.
     """
-    found = jax.vmap(encoder._log_probabilities, out_axes=-1)(windows)
+    found = jax.vmap(encoder._of_labels, out_axes=-1)(windows)
     labels = jnp.array(encoder.label_of_class)[classes]
-    return dataclasses.replace(encoder, sharpness=calibration.sharpness(found, labels))
+    return dataclasses.replace(encoder, sharpness=detectors.sharpness(found, labels))
+
+
+def centres(key: Key, points: Float[Array, "S D"], number: int) -> Float[Array, "{number} D"]:
+    """Centres of clusters: of several k-means (Lloyd 1982), those nearest to the points.
+
+    Starts are spread as in k-means++ (Arthur and Vassilvitskii 2007).
+    """
+    found, far = jax.lax.map(lambda k: _k_means(k, points, number), jax.random.split(key, _TRIES))
+    return found[jnp.argmin(far)]
+
+
+def nearest(points: Float[Array, "S D"], centres: Float[Array, "K D"]) -> Int[Array, " S"]:
+    """Index of the nearest centre to each point, int32."""
+    return jnp.argmin(_distances(points, centres), axis=1).astype(jnp.int32)
+
+
+def named(
+    members: Int[Array, " S"], classes: Int[Array, " S"], num_classes: int
+) -> Int[Array, " C"]:
+    """The cluster of each class, no two the same: those that share most points first.
+
+    Args:
+      members: cluster of each point.
+      classes: class of each point.
+      num_classes: C, the number of classes and of clusters; static.
+    """
+    counts = jnp.zeros((num_classes, num_classes), jnp.int32).at[classes, members].add(1)
+
+    def name(_: int, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        left, found = carry
+        poi_class, cluster = jnp.unravel_index(jnp.argmax(left), left.shape)
+        left = left.at[poi_class].set(-1).at[:, cluster].set(-1)
+        return left, found.at[poi_class].set(cluster)
+
+    found = jnp.zeros(num_classes, jnp.int32)
+    return jax.lax.fori_loop(0, num_classes, name, (counts, found))[1]
+
+
+def _k_means(key: Key, points: jax.Array, number: int) -> tuple[jax.Array, jax.Array]:
+    """Centres of one k-means, and the `[]` mean square distance of the points from them."""
+    first_key, *keys = jax.random.split(key, number)
+    chosen = points[jax.random.randint(first_key, (1,), 0, len(points))]
+    for next_key in keys:
+        far = jnp.min(_distances(points, chosen), axis=1)
+        row = jax.random.categorical(next_key, jnp.log(far + 1e-12))
+        chosen = jnp.concatenate([chosen, points[row][None]])
+
+    def move(centres: jax.Array, _: None) -> tuple[jax.Array, None]:
+        is_member = jax.nn.one_hot(nearest(points, centres), number)
+        counts = jnp.sum(is_member, axis=0)[:, None]
+        moved = product(is_member.T, points)
+        return jnp.where(counts > 0, moved / jnp.maximum(counts, 1), centres), None
+
+    found, _ = jax.lax.scan(move, chosen, None, _MOVES)
+    return found, jnp.mean(jnp.min(_distances(points, found), axis=1))
+
+
+def _distances(points: jax.Array, centres: jax.Array) -> jax.Array:
+    """`[S, K]` squared distances."""
+    return jnp.sum((points[:, None] - centres[None]) ** 2, axis=-1)
 
 
 def _columns(network: MLP, params: Params, x: jax.Array) -> jax.Array:
@@ -324,10 +358,3 @@ def _joint(params: Params, shape: Shape, means: list[jax.Array]) -> tuple[jax.Ar
 def _each(x: jax.Array, number: int) -> jax.Array:
     """`[..., K]` copies."""
     return jnp.broadcast_to(x[..., None], (*x.shape, number))
-
-
-def _divergence(mean, log_variance, mean_2, log_variance_2) -> jax.Array:
-    """Divergence of Gaussians whose dimensions are the first axis."""
-    ratio = jnp.exp(log_variance - log_variance_2)
-    distance = (mean - mean_2) ** 2 * jnp.exp(-jnp.asarray(log_variance_2))
-    return 0.5 * jnp.sum(ratio + distance - 1.0 - log_variance + log_variance_2, axis=0)

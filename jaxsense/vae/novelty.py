@@ -41,15 +41,12 @@ class Novelty:
     length: Float[Array, " M"]
 
     def weight(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """The share of a look that is new evidence.
+        """`[...]` shares of looks that are new evidence, above 0 and up to 1.
 
         Args:
           apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
             infinite for none.
           modality: index of the sensor.
-
-        Returns:
-          `[...]` weights above 0 and up to 1.
         """
         return _weight(apart, self.strength[modality], self.length[modality])
 
@@ -59,16 +56,10 @@ class Novelty:
         return LEAST_NEW**-0.5 - 1
 
     def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """Way from a place to where at least `LEAST_NEW` of a look is new.
+        """`[...]` metres to where at least `LEAST_NEW` of a look is new; 0 where it is already.
 
-        Args:
-          apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
-            infinite for none.
-          modality: index of the sensor.
-
-        Returns:
-          `[...]` metres straight away from the earlier looks, as if all that count were at the
-          nearest one; 0 where as much of a look is new already.
+        Straight away from the earlier looks, as if all that count were at the nearest one; for
+        `apart` see `weight`.
         """
         strength, length = self.strength[modality], self.length[modality]
         apart = jnp.minimum(apart, _FAR)
@@ -79,32 +70,23 @@ class Novelty:
 
 
 def independent(num_modalities: int) -> Novelty:
-    """All of every look is new evidence.
-
-    Args:
-      num_modalities: M.
-    """
+    """All of every look is new evidence."""
     return Novelty(jnp.zeros(num_modalities), jnp.ones(num_modalities))
 
 
 def fit(
     found: Float[Array, "S T C"], positions: Float[Array, "S T 2"], classes: Int[Array, " S"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Learns the weights of repeated looks by one sensor.
+    """`strength` and `length` of `Novelty` from repeated looks by one sensor, on a grid.
+
+    The maximum likelihood of the true classes among those for which the mean confidence after two
+    and more looks exceeds the accuracy by at most .0025, both from one place and from several:
+    likelihoods alone accept too much confidence in looks that repeat an error.
 
     Args:
       found: `[S, T, C]` log-likelihoods of the classes given each of T looks at a PoI.
       positions: `[S, T, 2]` places of the looks, in metres.
       classes: `[S]` int32 true classes.
-
-    Returns:
-      `[]` `strength` and `[]` `length` of `Novelty`, on a grid. Of those for which the mean
-      confidence after two and more looks exceeds the accuracy by at most .0025, both from one place
-      and from several, the ones for which the true classes are most likely: likelihoods alone
-      accept too much confidence in looks that repeat an error.
-
-    Raises:
-      ValueError: if a class does not exist.
     """
     checks.require_shape("found", found, (None, None, None))
     checks.require_shape("positions", positions, (*found.shape[:2], 2))

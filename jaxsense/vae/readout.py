@@ -1,4 +1,4 @@
-"""Class probabilities as a belief, and read from a belief.
+"""Class probabilities as a belief, and what a belief says about the classes.
 
 The Gaussian with the moments of the mixture `sum_c w_c q*_c` of the classes' joint posteriors holds
 the probabilities `w_c`: its mean and mean square are linear in them. Of all probabilities with
@@ -12,14 +12,14 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, product, pytree
 
 MIN_PROBABILITY = 1e-6
 """Minimum class probability that can be read; float32 moments hold no smaller ones."""
-
+PLAUSIBLE_DISTANCE = 2.0  # standard deviations
 
 _STEPS = 25  # of Newton's method
 _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
@@ -30,14 +30,11 @@ _THRESHOLD = 0.05  # of the largest singular value; smaller differences of momen
 
 @checks.typed
 def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
-    """Computes the belief with the moments of a mixture of the classes.
+    """The `[D]` belief with the moments of a mixture of the classes.
 
     Args:
       classes: `[C, D]` joint posterior of each class.
       probabilities: `[C]` of sum 1.
-
-    Returns:
-      `[D]` belief.
 
     Raises:
       ValueError: if `probabilities` are not within 0 and 1, or their sum is not 1.
@@ -50,15 +47,7 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
 
 
 def divergence(held: Float[Array, " C"], read: Float[Array, " C"]) -> Float[Array, ""]:
-    """Kullback-Leibler divergence of the class probabilities read from a belief.
-
-    Args:
-      held: `[C]` probabilities that were to be held.
-      read: `[C]` probabilities that are read, at least about `MIN_PROBABILITY`.
-
-    Returns:
-      `[]` in nats; 0 if the readout is exact.
-    """
+    """Divergence in nats of the class probabilities read from a belief from those held by it."""
     return jnp.sum(held * (jnp.log(jnp.maximum(held, MIN_PROBABILITY)) - jnp.log(read)))
 
 
@@ -77,14 +66,11 @@ class Readout:
     whitening: Float[Array, "2*D K"]
 
     def class_probabilities(self, belief: Belief, prior: Belief) -> Float[Array, " C"]:
-        """Probability of each class according to a belief.
+        """`[C]` probabilities, each at least about `MIN_PROBABILITY`.
 
         Args:
           belief: `[D]`.
           prior: `[D]` belief before any look, in which all classes are equally likely.
-
-        Returns:
-          `[C]` probabilities, each at least about `MIN_PROBABILITY`.
 
         Raises:
           ValueError: if the belief is not finite, or a standard deviation is not positive.
@@ -114,13 +100,12 @@ class Readout:
 
 
 def make(classes: Belief, most: int | None = None) -> Readout:
-    """The readout of beliefs in some classes.
+    """The readout of beliefs in `[C, D]` joint posteriors of classes.
 
     Args:
-      classes: `[C, D]` joint posterior of each class.
-      most: maximum of K. Log-posteriors that depend on the labels of sensors alone have one
-        direction less than each sensor has labels, see `directions`; by default, all that the
-        moments have.
+      classes: `[C, D]`.
+      most: maximum of K, by default the rank of the moments. Log-posteriors that depend on the
+        labels of sensors alone have `directions`.
     """
     checks.require_shape("classes.mean", classes.mean, (None, None))
     moments = _moments(classes)
@@ -139,6 +124,38 @@ def make(classes: Belief, most: int | None = None) -> Readout:
 def directions(numbers: Sequence[int]) -> int:
     """Directions of log-posteriors, for the number of labels of each sensor."""
     return sum(number - 1 for number in numbers)
+
+
+def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
+    """Norm `||sigma||_2` of positive standard deviations, the colour of the paper's Fig. 4."""
+    checks.require_shape("std", std, (..., None))
+    checks.require_positive("std", std)
+    return jnp.linalg.norm(std, axis=-1)
+
+
+def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[Array, " C"]:
+    """Classes whose `[C, D]` mean is within two standard deviations of a `[D]` belief's.
+
+    The nearest one always is plausible.
+
+    Raises:
+      ValueError: if an argument is not finite, or a standard deviation is not positive.
+    """
+    _check_belief(belief, class_means)
+    distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
+    return (distance <= PLAUSIBLE_DISTANCE) | (distance <= jnp.min(distance))
+
+
+def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array, ""]:
+    """The class whose mean is nearest to a belief's, int32; see `plausible_classes`."""
+    _check_belief(belief, class_means)
+    return jnp.argmin(jnp.linalg.norm(class_means - belief.mean[None], axis=-1))
+
+
+def _check_belief(belief: Belief, class_means: jax.Array) -> None:
+    checks.require_belief("belief", belief)
+    checks.require_shape("class_means", class_means, (None, *belief.mean.shape))
+    checks.require_finite("class_means", class_means)
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:

@@ -106,12 +106,13 @@ def loss(w, features, weights=(1.0, 1.0)):
 
 def retrain(w, windows=None, labels=None):
     """A detector that is retrained on eight windows."""
-    (size,) = w.models.detectors[1].offset.shape
+    size = w.models.detectors[1].window_size
     if windows is not None and windows.shape[1] == 61:
         windows = np.resize(windows, (8, size))
     windows = np.zeros((8, size)) if windows is None else windows
     labels = np.zeros(8, int) if labels is None else labels
-    return vae.retrain(w.key, w.models.detectors[1], windows, labels)
+    looks = vae.Looks(windows, np.ones(len(windows)))
+    return vae.retrain(w.key, w.models.detectors[1], looks, labels)
 
 
 def value_iteration(w, **changed):
@@ -557,7 +558,7 @@ FUNCTIONS = {
     ),
     "decode": (lambda w: vae.decode(w.params, w.model, jnp.zeros(3)), "z"),
     "posterior": (lambda w: vae.posterior(w.params, w.model, (w.x,)), "features has 1 entries"),
-    "detect": (lambda w: vae.detect(w.models.detectors[0], jnp.zeros(3)), "window"),
+    "detect": (lambda w: vae.detect(w.models.detectors[0], jnp.zeros(3), jnp.ones(())), "window"),
     "fuse std": (
         lambda w: vae.fuse(w.params, w.model, w.belief_of(std=-w.belief.std), w.seen, (w.x, None)),
         "belief.std = -1.0: must be greater than 0",

@@ -23,7 +23,7 @@ from jaxsense.models import make_jmvae
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.tasks.pretrained import PRETRAINED
-from jaxsense.vae import detectors, jmvae, latent
+from jaxsense.vae import detectors, jmvae, readout
 
 BATCH = 12
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
@@ -50,14 +50,14 @@ def check(loaded, name, expected, *keys):
 @pytest.mark.parametrize("m", [0, 1])
 def test_programs_of_a_sensor_give_what_jaxsense_gives(models, loaded, m):
     name, sensor = CONFIG.modalities[m], sensors.make(CONFIG)[m]
-    of_window = jax.jit(lambda window: detectors.detect(models.detectors[m], window))
+    of_window = jax.jit(lambda *look: detectors.features(models.detectors[m], *look))
 
     def detect(readings, bearing, distance):
         # The nearest window in the scan, ray by ray.
         first = round(float(sensor.centre(bearing)) - (sensor.window - 1) * sensor.stride / 2)
         rays = first + np.arange(sensor.window) * sensor.stride
         window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
-        features = np.asarray(of_window(window))
+        features = np.asarray(of_window(window, distance))
         return True, True, features.max() >= CONFIG.mission.least_confidence, features
 
     @jax.jit
@@ -169,7 +169,7 @@ def test_the_map_is_read_as_jaxsense_reads_it(models, loaded):
     @jax.vmap
     def classify(mean, std):
         belief, fusion = Belief(mean, std), models.fusion
-        plausible = latent.plausible_classes(belief, means)
+        plausible = readout.plausible_classes(belief, means)
         return fusion.class_probabilities(belief), fusion.most_likely_class(belief), plausible
 
     check(loaded, "classify", classify, "probabilities", "most_likely", "plausible")
@@ -216,11 +216,7 @@ def test_a_robot_searches_its_scans_as_missions_do(models):
     mission = dataclasses.replace(CONFIG.mission, localisation=LocalisationConfig(search=errors))
     found = export.functions(dataclasses.replace(CONFIG, mission=mission))
     # Untrained detectors have no scale, and are never unsure.
-    sure = jnp.float32(1.0)
-    unsure = [
-        dataclasses.replace(x, scale=sure, gate=dataclasses.replace(x.gate, scale=sure))
-        for x in models.detectors
-    ]
+    unsure = [dataclasses.replace(x, scale=jnp.float32(1.0)) for x in models.detectors]
     models = dataclasses.replace(models, detectors=tuple(unsure))
     sensor, (detect, _) = sensors.make(CONFIG)[1], found["detect_lidar"]
     scan = np.random.default_rng(0).uniform(0.1, 1.0, sensor.shape).astype(np.float32)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE, alone, with_config, with_gates
+from teams import CONFIG, NAIVE, alone, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
@@ -19,7 +19,7 @@ def team():
 
 @pytest.fixture(scope="session")
 def models():
-    return with_gates(jaxsense.init(jax.random.key(0), CONFIG))
+    return with_eyes(jaxsense.init(jax.random.key(0), CONFIG))
 
 
 @pytest.fixture(scope="session")

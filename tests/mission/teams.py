@@ -8,7 +8,8 @@ import numpy as np
 
 from jaxsense import dqn, mission
 from jaxsense.config import PRESETS
-from jaxsense.vae import readout
+from jaxsense.core.types import pytree
+from jaxsense.vae import detectors, readout
 
 # Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
 _FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=False)
@@ -32,38 +33,42 @@ def with_class_beliefs(models, classes):
     return replace(models, fusion=fusion)
 
 
-def with_gates(models):
-    """Models whose gates read the middle of a window, without noise worth mention.
+@pytree
+class Seeing:
+    """A detector whose odds are read from the middle of a window, without noise worth mention.
 
-    The camera's passes what is coloured there, and the LiDAR's what is there at most 0.24 m nearer
-    than the centre of the PoI.
+    A camera finds what is coloured there, and a LiDAR what is there at most 0.24 m nearer than the
+    centre of the PoI.
     """
-    camera, lidar = models.detectors
-    weights = np.zeros((242, 32), np.float32)
-    colours = weights[: 3 * 80].reshape(80, 3, 32)
-    colours[37:43, 0, 0] = colours[37:43, 1, 1] = 1 / 6  # red, green
-    colours[37:43, 2, :2] = -1 / 6  # less blue
-    of_camera = _gate(camera, weights, 0.0, np.array([1.0, 1.0]), -0.1)
-    weights = np.zeros((130, 32), np.float32)
-    weights[60:68, 0] = 0.2 / 8  # the range less the distance, of which it reads a fifth of a metre
-    weights[:, 1] = -weights[:, 0]
-    of_lidar = _gate(lidar, weights, np.array([0.12, -0.12]), np.array([-1.0, -1.0]), 0.12)
-    return replace(models, detectors=(of_camera, of_lidar))
+
+    detector: detectors.Classifier
+    sharpness: np.float32 = np.float32(1.0)
+
+    @property
+    def num_labels(self):
+        return self.detector.num_labels
+
+    @property
+    def window_size(self):
+        return self.detector.window_size
+
+    @property
+    def threshold(self):
+        return jnp.float32(0.0)
+
+    def logits(self, window, distance):
+        labels = self.detector.logits(window, distance)[:-1]
+        if self.detector.measures_distance:
+            odds = 0.12 - jnp.abs(jnp.mean(window[60:68] - distance) + 0.12)
+        else:
+            red, green, blue = jnp.mean(window.reshape(80, 3)[37:43], axis=0)
+            odds = jax.nn.relu(red - blue) + jax.nn.relu(green - blue) - 0.1
+        return jnp.append(labels, self.sharpness * odds)
 
 
-def _gate(detector, first, bias, second, last):
-    """A detector whose gate adds up two units."""
-    params = jax.tree.map(np.zeros_like, detector.gate.params)
-    layers = params["params"]
-    # It reads distances as they are, and all else standardised.
-    scale = 1.0 if detector.gate.measures_distance else detector.scale
-    layers["Dense_0"]["kernel"][:] = first * scale
-    layers["Dense_0"]["bias"][:2] = bias
-    layers["Dense_1"]["kernel"][[0, 1], [0, 1]] = 1.0
-    layers["Dense_2"]["kernel"][:2, 0] = second
-    layers["Dense_2"]["bias"][0] = last
-    gate = replace(detector.gate, params=params, threshold=np.float32(0.0))
-    return replace(detector, gate=gate)
+def with_eyes(models):
+    """Models of a camera and a LiDAR that find PoIs without a training."""
+    return replace(models, detectors=tuple(map(Seeing, models.detectors)))
 
 
 def alone(function):

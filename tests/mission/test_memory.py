@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, LATENT, POSES, POSITIONS, alone, with_config, with_gates
+from teams import CONFIG, LATENT, POSES, POSITIONS, alone, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
@@ -37,7 +37,7 @@ def communicating(config, **settings):
 @pytest.fixture(scope="module")
 def own_models():
     """Models with a filter that says different things of different features."""
-    models = with_gates(jaxsense.init(jax.random.key(0), communicating(CONFIG)))
+    models = with_eyes(jaxsense.init(jax.random.key(0), communicating(CONFIG)))
     classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
     fusion = models.fusion
     assert isinstance(fusion, Filter)

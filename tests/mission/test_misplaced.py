@@ -52,7 +52,7 @@ def test_a_robot_scans_where_it_believes_the_poi_to_be(
     assert (robots.looks[robot], robots.detections[robot]) == (looks, detections)
 
 
-def test_the_gate_is_given_the_distance_that_the_robot_believes(scan, facing):
+def test_a_detector_is_given_the_distance_that_the_robot_believes(scan, facing):
     # The LiDAR's refuses what is 0.24 m nearer than expected.
     for error, detections in ((0.0, 1), (-0.1, 1), (-0.3, 0)):
         state = facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0])
@@ -62,14 +62,9 @@ def test_the_gate_is_given_the_distance_that_the_robot_believes(scan, facing):
 
 @pytest.fixture(scope="module")
 def certain(models):
-    """Models whose gates are certain of what they pass, as trained ones are."""
-
-    def of(detector):
-        params = jax.tree.map(np.array, detector.gate.params)
-        params["params"]["Dense_2"] = {n: 300 * x for n, x in params["params"]["Dense_2"].items()}
-        return replace(detector, gate=replace(detector.gate, params=params))
-
-    return replace(models, detectors=tuple(map(of, models.detectors)))
+    """Models whose detectors are certain of what they find, as trained ones are."""
+    sure = (replace(detector, sharpness=np.float32(300)) for detector in models.detectors)
+    return replace(models, detectors=tuple(sure))
 
 
 def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain):
@@ -118,7 +113,7 @@ def test_a_robot_that_searches_finds_what_its_errors_explain(
 
 @pytest.mark.slow
 def test_a_robot_that_searches_tries_other_distances(searches, facing):
-    # The gate refuses what is more than .24 m nearer than expected. The cube's side is, by .3 m.
+    # The LiDAR refuses what is more than .24 m nearer than expected. The cube's side is, by .3 m.
     state = facing(LIDAR, [0.0, 0.0, 0.0], [-0.2, 0.0, 0.0])
     for position, detections in ((0.03, 0), (0.12, 1)):
         robots = searches(SearchConfig(position=position))(state, LIDAR).robots

@@ -138,7 +138,7 @@ def changed_scan(sensor, reading):
     ],
 )
 def test_a_window_with_a_reading_that_is_none_is_not_known(m, reading, is_known):
-    # An untrained gate passes all that it can judge.
+    # An untrained detector passes all that it can judge.
     sensor = (CAMERA, LIDAR)[m]
     scan = changed_scan(sensor, reading)
     found = MODELS.detect(m, sensor, scan, jnp.float32(0.0), jnp.float32(1.0))

@@ -183,3 +183,30 @@ def test_exact_bayes_reads_the_same_looks():
     error = 4 * np.sqrt(share * (1 - share) / 600) * np.log(2)
     assert np.all(np.abs(found["bayes_nll"] - share * np.log(2)) < error)
     assert np.all(np.diff(found["bayes_nll"]) <= 1e-6)
+
+
+def test_active_units_counts_dimensions_whose_means_vary():
+    # Variances of +-a: a^2 = 1, .0144, .0064 and 0, of which two exceed .01; an offset is no use.
+    mean = jnp.array([[1.0, 0.12, 0.08, 7.0], [-1.0, -0.12, -0.08, 7.0]])
+    assert measures.active_units(mean) == 2
+
+
+def test_moment_matching_error_as_worked_by_hand():
+    # The components match N(2, 3^2) and N(1, .5^2), see test_gaussian.
+    # Dimension 1: |3.5 - 2| / 3 + |ln(6/3)| = .5 + .693147; dimension 2: |.9 - 1| / .5 + 0 = .2.
+    components = _belief(((0.0, 1.0), (4.0, 1.0)), ((1.0, 0.5), (3.0, 0.5)))
+    error = measures.moment_matching_error(_belief((3.5, 0.9), (6.0, 0.5)), components)
+    np.testing.assert_allclose(error, (0.5 + 0.693147 + 0.2) / 2, rtol=1e-5)
+    # Too narrow counts as much as too wide.
+    narrow = measures.moment_matching_error(_belief((0.5, 1.1), (1.5, 0.5)), components)
+    np.testing.assert_allclose(narrow, error, rtol=1e-5)
+
+
+def test_consistent_classes_share_a_label():
+    # Colours of green cylinder, red cylinder, red cube.
+    expected = [[True, False, False], [False, True, True], [False, True, True]]
+    np.testing.assert_array_equal(measures.consistent_classes((1, 0, 0)), expected)
+
+
+def _belief(mean, std):
+    return Belief(jnp.array(mean), jnp.array(std))

@@ -137,8 +137,9 @@ def test_encoders_are_detectors(learned):
         assert bank.shape == (3, 12, 2)
         np.testing.assert_allclose(bank.sum(axis=-1), 1, rtol=1e-5)
         window = outputs["survey"].others.windows[m][0, 0]
-        assert jax.eval_shape(encoder.features, window).shape == (2,)
-        assert np.isfinite(encoder.gate.threshold)
+        found = jax.eval_shape(encoder.logits, window, jnp.float32(1.0))
+        assert found.shape == (3,)
+        assert np.isfinite(encoder.threshold)
     grouped = outputs["grouped"]
     assert set(grouped) == {"pair", "all_looks"}
     assert all(0 <= x <= 1 for x in grouped.values())
@@ -149,7 +150,7 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
     outputs, listed = learned.outputs, stages_of(TINY)
     num_bank = num_scenes(TINY)[1]
     shown = jnp.arange(num_bank * TINY.arena.num_pois).reshape(num_bank, -1) % 3
-    monkeypatch.setattr(looks, "detect_all", lambda trained, windows: tuple(
+    monkeypatch.setattr(looks, "features", lambda trained, windows, distances: tuple(
         jnp.concatenate([shown, jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9)])[..., None]
         for w in windows
     ))  # fmt: skip
@@ -213,7 +214,7 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     np.testing.assert_array_equal(given[0], windows[30:].reshape(-1, size))
     np.testing.assert_array_equal(given[1], outputs["shown"].calibrating.reshape(-1))
     np.testing.assert_array_equal(problem.shown.windows, windows[:30].reshape(-1, size))
-    np.testing.assert_allclose(encoder.gate.offset, windows[:30].mean(axis=(0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(encoder.presence.offset, windows[:30].mean(axis=(0, 1)), rtol=1e-5)
     assert all(len(x) == 10 * TINY.arena.num_pois for x in outputs["views"].groups)
 
 
@@ -243,7 +244,7 @@ def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
     windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
     classes, scenes = jnp.repeat(group[:, None], 3, axis=1) % 3, cast("Any", group)
     survey = Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
-    monkeypatch.setattr(looks, "detect_all", lambda trained, windows: windows)
+    monkeypatch.setattr(looks, "features", lambda trained, windows, distances: windows)
 
     @jax.jit
     def starts(survey):
@@ -281,14 +282,14 @@ def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
     def repeat(keys, world, classes, modality, number, places):
         given[modality] = classes, places
         assert number == 4  # looks in a scene
-        return jnp.zeros((30, number, 2)), jnp.zeros((30, number, 2))
+        return jnp.zeros((30, number, 2)), jnp.ones((30, number)), jnp.zeros((30, number, 2))
 
     def fit(found, positions, classes):
         given["fit"] = classes
         return jnp.float32(0), jnp.float32(1)
 
     monkeypatch.setattr(looks, "repeats", repeat)
-    monkeypatch.setattr(detectors, "detect", lambda detector, window: jnp.ones(2) / 2)
+    monkeypatch.setattr(detectors, "features", lambda *_: jnp.ones(2) / 2)
     monkeypatch.setattr(novelty, "fit", fit)
     stage, outputs = stages_of(REPEATING)["novelty"], learned.outputs
     shown = dataclasses.replace(outputs["shown"], bank=jnp.full_like(outputs["shown"].bank, 2))
@@ -302,7 +303,7 @@ def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
 
 
 def test_encoders_are_calibrated_once(learned, monkeypatch):
-    """Before the gate is trained: a run finishes a stage after every chunk, to check it."""
+    """Before it learns where PoIs are: a run finishes a stage after every chunk, to check it."""
     stage = stages_of(TINY)["detector_lidar"]
     state = begun(stage, TINY, learned.outputs)
     monkeypatch.setattr(leave_one_out, "calibrate", None)
@@ -310,4 +311,4 @@ def test_encoders_are_calibrated_once(learned, monkeypatch):
     finish = jax.jit(lambda state, inputs: stage.finish(TINY, state, **inputs))
     found = finish(state, inputs_of(stage.name, TINY, learned.outputs))
     assert found.sharpness == learned.outputs["detector_lidar"].sharpness
-    assert np.isfinite(found.gate.threshold)
+    assert np.isfinite(found.threshold)

@@ -70,16 +70,16 @@ def used(arrays):
 
 def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
     assert len(used(surveys.scenes)) == sum(num_scenes(MEASURED))  # no key twice
-    trained_on, shown_to_gates = [], []
+    trained_on, of_nothing = [], []
 
     def fit(key, state, problem, number):
-        trained_on.append(np.asarray(problem.detector.windows))
-        shown_to_gates.append(np.asarray(problem.gate.shown.windows))
+        trained_on.append(np.asarray(problem.shown.windows))
+        of_nothing.append(np.asarray(problem.nothing.windows))
         return state, jnp.zeros(number)
 
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
-    monkeypatch.setattr(detectors, "detect", lambda detector, window: window)
+    monkeypatch.setattr(detectors, "features", lambda detector, window, distance: window)
     divided = listed["survey"].finish(MEASURED, surveys)
     examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=divided)
     given = {"surveys": divided, "examples": examples}
@@ -97,16 +97,13 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     assert plotted <= held_out
     # All of them were looked at.
     assert len(seen) >= 31 / 3
-    # Gates learn from the same scenes, and from empty ones that nothing else uses.
-    checks = used(examples[0].checks.windows)
-    assert used(shown_to_gates) == seen
-    assert checks <= bank | starts
-    assert set(examples[0].distances.tolist()) == {1.0}
+    # And they learn from empty scenes that nothing else uses.
     is_empty = np.asarray(surveys.distances[:, 0, 0]) == 2
     assert is_empty.sum() == num_scenes(MEASURED)[3] == 2  # of 11 to train on
     empty = used(surveys.scenes[is_empty])
     assert empty.isdisjoint(seen | bank | held_out | starts)
-    assert used(np.float32(list(empty))) <= used(examples[0].nothing.windows)
+    assert used(np.float32(list(empty))) <= used(examples[0].windows)
+    assert used(of_nothing) <= used([x.windows for x in examples])
     assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
 
 

@@ -1,6 +1,7 @@
-"""Detectors on synthetic windows."""
+"""Detectors on windows whose answer is known: labels, "nothing there", and how sure they are."""
 
 import functools
+import re
 from dataclasses import replace
 
 import jax
@@ -10,229 +11,323 @@ import pytest
 
 from jaxsense.config import DetectorConfig
 from jaxsense.core import supervised
-from jaxsense.vae import calibration, detectors
+from jaxsense.dqn.optimum import LookValues
+from jaxsense.vae import detectors
+from jaxsense.vae.detectors import Classifier, Looks
 
-CONFIG = DetectorConfig(hidden=(16,), steps=200, batch=64, learning_rate=1e-2)
-
-
-calibrate = jax.jit(detectors.calibrate)
-detect = jax.jit(jax.vmap(detectors.detect, in_axes=(None, 0)))
-logits_of = jax.jit(jax.vmap(detectors.logits, in_axes=(None, 0)))
+CONFIG = DetectorConfig(hidden=(16,), steps=400, batch=64, learning_rate=1e-2)
+KEY = jax.random.key(0)
+RAYS = 8
+SHAPES = np.array([[0, 0, 0, 1, 1, 0, 0, 0], [0, 0, 1, 1, 1, 1, 0, 0]])
+detect = jax.jit(detectors.detect)
+detect_all = jax.jit(jax.vmap(detectors.detect, (None, 0, 0)))
+features_of = jax.jit(jax.vmap(detectors.features, (None, 0, 0)))
 retrain = jax.jit(detectors.retrain)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def synthetic_windows(key, number):
-    """Windows of 6 readings around 5: the label says whether the middle two stand out."""
-    label_key, noise_key = jax.random.split(key)
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def some_looks(key, number, is_shown=True):
+    """Ranges of 3 m, in which a PoI stands out by its width: where it is expected, or elsewhere."""
+    distance_key, label_key, noise_key = jax.random.split(key, 3)
+    distances = jax.random.uniform(distance_key, (number,), minval=0.5, maxval=2.0)
     labels = jax.random.randint(label_key, (number,), 0, 2)
-    bump = jnp.array([0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-    noise = 0.2 * jax.random.normal(noise_key, (number, 6))
-    return 5.0 + labels[:, None] * bump[None] + noise, labels
-
-
-def accuracy(detector, windows, labels):
-    features = detect(detector, windows)
-    return np.mean(features.argmax(axis=-1) == labels)
-
-
-def fit(detector, windows, labels, config):
-    problem = detectors.Fitting(config, detector, windows, labels)
-    state = supervised.start(detector.params, config)
-    train = jax.jit(lambda key, state: supervised.fit(key, state, problem, config.steps))
-    return train(jax.random.key(2), state)
+    at = distances if is_shown else jnp.roll(distances, 1) + 0.5
+    windows = jnp.where(jnp.array(SHAPES)[labels] == 1, at[:, None], 3.0)
+    windows += 0.02 * jax.random.normal(noise_key, windows.shape)
+    return Looks(windows, distances), labels
 
 
 @pytest.fixture(scope="module")
-def trained():
-    windows, labels = synthetic_windows(jax.random.key(0), 1000)
-    detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
-    state, losses = fit(detector, windows, labels, CONFIG)
-    return detector, replace(detector, params=state.params), losses
+def problem():
+    shown, labels = some_looks(jax.random.key(1), 1000)
+    nothing, _ = some_looks(jax.random.key(2), 500, False)
+    untrained = detectors.init(KEY, shown.windows, 2, CONFIG, measures_distance=True)
+    return detectors.Fitting(CONFIG, untrained, shown, labels, nothing)
 
 
-def test_training_learns_a_separable_set(trained):
-    untrained, detector, losses = trained
-    windows, labels = synthetic_windows(jax.random.key(3), 1000)
-    assert accuracy(detector, windows, labels) >= 0.99
-    assert accuracy(untrained, windows, labels) < 0.9
-    assert losses.shape == (200,)
+@pytest.fixture(scope="module")
+def trained(problem):
+    """A detector, and the losses of its training."""
+    start = supervised.start(problem.detector.params, CONFIG)
+    fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, CONFIG.steps))
+    state, losses = fit(jax.random.key(2), start)
+    found = replace(problem.detector, params=state.params)
+    return jax.jit(detectors.fitted)(found, problem.shown, problem.nothing), losses
+
+
+def linear(kernel, bias, threshold=-np.inf):
+    """A detector without hidden layers, which reads the window, the distance and its inverse."""
+    kernel, bias = np.float32(kernel), np.float32(bias)
+    params = {"params": {"Dense_0": {"kernel": kernel, "bias": bias}}}
+    size, scale = len(kernel) - 2, jnp.float32(1.0)
+    threshold = jnp.float32(threshold)
+    return Classifier(params, jnp.zeros(size), scale, threshold, False, (), len(bias) - 1)
+
+
+def accuracy(detector, looks, labels):
+    found = features_of(detector, looks.windows, looks.distances)
+    return np.mean(found.argmax(axis=-1) == labels)
+
+
+def test_a_trained_detector_tells_labels_apart_and_pois_from_nothing(problem, trained):
+    detector, losses = trained
+    (shown, labels), (nothing, _) = (
+        some_looks(jax.random.key(3 + i), 2000, i == 0) for i in range(2)
+    )
+    assert accuracy(detector, shown, labels) >= 0.99
+    assert accuracy(problem.detector, shown, labels) < 0.9
     assert losses[-20:].mean() < 0.1 * losses[:5].mean()
+    found, of_nothing = (detect_all(detector, x.windows, x.distances) for x in (shown, nothing))
+    assert found.is_there.mean() >= 0.97
+    assert of_nothing.is_there.mean() <= 0.05
+    np.testing.assert_allclose(found.features.sum(axis=1), 1.0, rtol=1e-5)
 
 
-def test_detect_gives_probabilities_of_the_labels_in_order(trained):
-    _, detector, _ = trained
-    windows, labels = synthetic_windows(jax.random.key(4), 50)
-    features = detect(detector, windows)
-    assert features.shape == (50, 2)
-    np.testing.assert_allclose(features.sum(axis=-1), 1.0, rtol=1e-6)
-    np.testing.assert_array_equal(features[:, 1] > 0.5, labels == 1)
+def test_one_distribution_holds_labels_and_nothing():
+    # Odds of 3 to 1 for the first label, and of 4 to 1 that the PoI is there.
+    found = detectors.log_probabilities(jnp.log(jnp.array([3.0, 1.0, 4.0])))
+    np.testing.assert_allclose(np.exp(found), [0.6, 0.2, 0.2], rtol=1e-5)
+    found = detectors.log_probabilities(jnp.array([[0.0], [0.0], [-80.0]]))
+    np.testing.assert_allclose(found[:, 0], [-80 - np.log(2), -80 - np.log(2), 0], atol=1e-4)
 
 
-def with_logits(*logits):
-    """A detector of these logits for every window, half by its last bias and half by its kernel."""
-    detector = detectors.init(jax.random.key(0), jnp.zeros((2, 3)), len(logits), CONFIG)
-    layers = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), detector.params["params"])
-    half = np.float32(logits) / 2
-    layers["Dense_0"]["bias"][0] = 1.0
-    layers["Dense_1"]["kernel"][0] = layers["Dense_1"]["bias"][:] = half
-    return replace(detector, params={"params": layers})
+def test_the_loss_is_the_mean_cross_entropy_of_both_kinds_of_looks():
+    # Labels as likely as one another; the log-odds that a PoI is there are its distance.
+    detector = linear([[0, 0, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 0])
+    looks = lambda *at: Looks(jnp.zeros((len(at), 1)), jnp.array(at))  # noqa: E731
+    problem = detectors.Fitting(CONFIG, detector, looks(2.0, 0.5), jnp.array([0, 1]), looks(1.0))
+    drawn = jnp.array([0, 1]), jnp.array([0])
+    # -log sigmoid(2) = .126928, -log sigmoid(.5) = .474077, log 2 for the label; and
+    # -log(1 - sigmoid(1)) = 1.313262.
+    expected = (0.126928 + 0.474077) / 2 + np.log(2) + 1.313262
+    found = problem.loss(detector.params, drawn, jnp.int32(0))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_half_as_many_looks_at_nothing_are_drawn(problem):
+    few = replace(problem, nothing=jax.tree.map(lambda x: x[:3], problem.nothing))
+    shown, nothing = jax.jit(few.draw, static_argnums=1)(KEY, 50)
+    assert (shown.shape, nothing.shape) == ((50, 64), (50, 32))
+    assert set(np.asarray(nothing).ravel()) == {0, 1, 2}
+    assert shown.max() > 900
+    assert len(np.unique(shown[:, 0])) > 40
+
+
+def scored(scores):
+    return Looks(jnp.zeros((len(scores), 1)), jnp.asarray(scores, jnp.float32))
+
+
+def test_a_threshold_loses_one_look_in_a_hundred_and_no_more_than_needed():
+    detector = linear([[0, 0, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 0])
+    scores = np.linspace(1.0, 1001.0, 1001)  # of looks at PoIs: 1 % of them are below 11
+    fitted = jax.jit(detectors.fitted)
+    # 0.2 % of the looks at nothing are above 5.99 of 0 to 6.
+    for nothing, expected in ((scores + 5.0, 11.0), (np.linspace(1e-3, 6.0, 1001), 0.998 * 6.0)):
+        found = fitted(detector, scored(scores), scored(nothing))
+        factor = found.params["params"]["Dense_0"]["kernel"][1, 2]
+        assert found.threshold / factor == pytest.approx(expected, rel=1e-3)
+
+
+def test_odds_are_those_of_looks_that_training_did_not_use():
+    rng, true = np.random.default_rng(0), np.float32(0.5)
+    scores = rng.uniform(0.01, 4.0, 20_000)
+    is_shown = rng.uniform(size=len(scores)) < 1 / (1 + np.exp(-true * (scores - 2)))
+    detector = linear([[0, 0, 0], [0, 0, 1], [0, 0, 0]], [0, 0, -2])
+    found = jax.jit(detectors.fitted)(detector, scored(scores[is_shown]), scored(scores[~is_shown]))
+    last = found.params["params"]["Dense_0"]
+    np.testing.assert_allclose(last["kernel"][1, 2], true, rtol=0.06)
+    np.testing.assert_allclose(last["bias"], [0, 0, -2 * last["kernel"][1, 2]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("reading", "distance", "is_known"),
+    [
+        (1.0, 1.0, True), (np.nan, 1.0, False), (-np.inf, 1.0, False), (1.0, np.nan, False),
+        (1.0, np.inf, False), (1.0, 0.0, False), (1.0, -1.0, False),
+    ],
+)  # fmt: skip
+def test_an_untrained_detector_answers_what_is_valid(problem, reading, distance, is_known):
+    window = np.ones(RAYS, np.float32)
+    window[2] = reading
+    found = detect(problem.detector, window, np.float32(distance))
+    assert (found.is_known, found.is_there) == (is_known, is_known)
+    assert is_known or found.features.tolist() == [0.5, 0.5]
+
+
+def test_below_its_threshold_a_look_shows_nothing():
+    # Log-odds are the distance, and the first label is nine times as likely.
+    kernel = [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
+    detector = linear(kernel, [np.log(9), 0, 0], threshold=0.8)
+    for distance, features in ((0.79, [0.5, 0.5]), (0.81, [0.9, 0.1])):
+        found = detect(detector, jnp.zeros(1), jnp.float32(distance))
+        assert found.is_known
+        assert found.is_there == (distance > 0.8)
+        np.testing.assert_allclose(found.features, features, rtol=1e-5)
+        given = detectors.features(detector, jnp.zeros(1), jnp.float32(distance))
+        np.testing.assert_allclose(given, [0.9, 0.1], rtol=1e-5)
+
+
+def test_a_detector_of_ranges_reads_how_far_they_are_from_the_poi(problem):
+    # Without what reads ranges and the expected distance themselves.
+    weights = jax.tree.map(np.array, problem.detector.params)
+    first = weights["params"]["Dense_0"]["kernel"]
+    first[:RAYS] = first[2 * RAYS :] = 0.0
+    of_range = replace(problem.detector, params=weights)
+    window = np.linspace(0.9, 1.1, RAYS, dtype=np.float32)
+    read = jax.jit(Classifier.logits)
+    near = read(of_range, window, np.float32(1.0))
+    np.testing.assert_allclose(read(of_range, window + 0.5, np.float32(1.5)), near, atol=1e-5)
+    assert np.abs(read(of_range, window + 0.1, np.float32(1.0)) - near).max() > 1e-3
+    # Beyond half a metre it makes no difference how far.
+    far, farther = (read(of_range, window + x, np.float32(1.0)) for x in (2.0, 3.0))
+    np.testing.assert_allclose(far, farther, atol=1e-5)
 
 
 @pytest.mark.parametrize(
     ("temperature", "left", "error"),
-    [
-        (0.25, 1.0, 1e-5),
-        (0.5, 1.0, 1e-5),
-        (1.0, 1.0, 1e-5),
-        (2.0, 1.0, 1e-5),
-        (4.0, 1.0, 1e-5),
-        # 257 temperatures from 1/4 to 4 are steps of 16^(1/256) = 1.0109: half of one away at most.
-        (3.0, 1.0, 0.0055),
-        (0.7, 1.0, 0.0055),
-        # Beyond 4 and 1/4 some of it is left.
-        (8.0, 2.0, 1e-5),
-        (0.1, 0.4, 1e-5),
-    ],
+    # 513 temperatures from 1/16 to 16 are steps of 16^(1/256) = 1.0109: half of one away at most.
+    # Beyond 16 some of it is left.
+    [(0.25, 1.0, 1e-5), (1.0, 1.0, 1e-5), (3.0, 1.0, 0.0055), (32.0, 2.0, 1e-5)],
 )
-def test_calibration_finds_the_temperature_of_the_logits(temperature, left, error):
+def test_calibration_finds_the_temperature_of_the_labels(temperature, left, error):
     # Of ten looks that are all the same eight are of label 0: logits should be ln(8 / 2) apart.
     right, labels = np.log(4.0), jnp.array([0] * 8 + [1] * 2)
-    detector = with_logits(0.5 + temperature * right, 0.5)
-    calibrated = calibrate(detector, jnp.zeros((10, 3)), labels)
-    logits = logits_of(calibrated, jnp.zeros((1, 3)))[0]
-    assert logits[0] - logits[1] == pytest.approx(left * right, rel=error)
+    half = np.array([0.5 + temperature * right, 0.5, 1.0]) / 2
+    detector = linear([half, [0, 0, 0], [0, 0, 0]], half)
+    looks = Looks(jnp.ones((10, 1)), jnp.ones(10))
+    calibrated = jax.jit(detectors.calibrate)(detector, looks, labels)
+    found = calibrated.of(looks)[:, 0]
+    assert found[0] - found[1] == pytest.approx(left * right, rel=error)
+    np.testing.assert_allclose(found[-1], 1.0, rtol=1e-5)
 
 
-def test_calibration_reads_windows_as_the_detector_does(trained):
-    # Labels are drawn by its own logits, and by flatter and sharper ones.
-    _, detector, _ = trained
-    windows, _ = synthetic_windows(jax.random.key(5), 4000)
-    logits = logits_of(detector, windows)
-    is_unsure = jnp.abs(logits[:, 0] - logits[:, 1]) < 4
-    unsure, logits = windows[is_unsure], logits[is_unsure]
-    for sharpness in (0.5, 1.0, 2.0):
-        labels = jax.random.categorical(jax.random.key(6), sharpness * logits)
-        calibrated = calibrate(detector, unsure, labels)
-        found = logits_of(calibrated, unsure)
-        ratio = np.sum(found * logits) / np.sum(logits**2)
-        np.testing.assert_allclose(found, ratio * logits, atol=1e-4)
-        # Four standard errors of the most likely sharpness, and a step of the search.
-        apart = np.asarray(logits[:, 0] - logits[:, 1])
-        spread = 1 / (2 + 2 * np.cosh(sharpness * apart))  # p (1 - p) of each label
-        error = 4 / np.sqrt(np.sum(spread * apart**2)) + 0.011 * sharpness
-        np.testing.assert_allclose(ratio, sharpness, atol=error)
-
-
-def test_calibration_changes_no_label_and_never_makes_the_looks_less_likely(trained):
-    _, detector, _ = trained
-    of_one, labels = synthetic_windows(jax.random.key(7), 300)
-    # Half way between the labels, where the detector is unsure.
-    windows = (of_one + of_one[::-1]) / 2
-    for given in (labels, 1 - labels, jnp.zeros(300, int)):
-        calibrated = calibrate(detector, windows, given)
-        before, after = (detect(d, windows) for d in (detector, calibrated))
-        np.testing.assert_array_equal(before.argmax(axis=1), after.argmax(axis=1))
-        nll_before, nll_after = (
-            calibration.negative_log_likelihood(p, given) for p in (before, after)
-        )
-        assert nll_after <= nll_before + 1e-6
-
-
-def test_a_training_starts_from_the_loss_of_the_detector_it_is_given():
-    windows, labels = synthetic_windows(jax.random.key(0), 1000)
-    detector = detectors.init(jax.random.key(1), windows, 2, CONFIG)
-    config = replace(CONFIG, steps=20, batch=256, learning_rate=1e-12)
-    _, losses = fit(detector, windows, labels, config)
-    assert len(np.unique(losses)) == 20  # every step draws anew
-    each = detect(detector, windows)
-    expected = -np.log(np.asarray(each)[np.arange(1000), labels])
-    error = expected.std() / np.sqrt(20 * 256)
-    np.testing.assert_allclose(losses.mean(), expected.mean(), atol=4 * error)
+def test_calibration_error_and_likelihood_by_hand():
+    # In the bin above 14/15: .95 and 1.0, of which one is right; in that above .6: .65, right.
+    probabilities = jnp.array([[0.95, 0.05], [0.0, 1.0], [0.65, 0.35]])
+    labels = jnp.array([0, 0, 0])
+    expected = (abs(0.95 + 1.0 - 1) + abs(0.65 - 1)) / 3
+    assert detectors.calibration_error(probabilities, labels) == pytest.approx(expected, abs=1e-6)
+    found = detectors.negative_log_likelihood(probabilities[::2], labels[::2])
+    assert found == pytest.approx(-(np.log(0.95) + np.log(0.65)) / 2, rel=1e-5)
+    # A label of probability zero costs no more than a finite number.
+    assert np.isfinite(detectors.negative_log_likelihood(probabilities, labels))
 
 
 def test_init_standardises_the_readings():
     windows = jnp.array([[1.0, 10.0], [3.0, 14.0]])
-    detector = detectors.init(jax.random.key(0), windows, 2, CONFIG)
+    detector = detectors.init(KEY, windows, 2, CONFIG)
     np.testing.assert_allclose(detector.offset, [2.0, 12.0])  # the mean of each reading
     # Deviations -1, 1, -2, 2: one scale for all of them, sqrt((1 + 1 + 4 + 4) / 4) = 1.581139.
     np.testing.assert_allclose(detector.scale, 1.581139, rtol=1e-5)
-
-
-def test_logits_do_not_depend_on_the_unit_of_the_readings():
-    windows, _ = synthetic_windows(jax.random.key(0), 100)
-    key = jax.random.key(1)
-    in_metres = detectors.init(key, windows, 2, CONFIG)
-    in_millimetres = detectors.init(key, 1000.0 * windows + 300.0, 2, CONFIG)
-    np.testing.assert_allclose(
-        logits_of(in_metres, windows[:3]),
-        logits_of(in_millimetres, 1000.0 * windows[:3] + 300.0),
-        atol=1e-3,
+    again = detectors.init(KEY, 1000.0 * windows + 300.0, 2, CONFIG)
+    found, same = (
+        features_of(x, y, jnp.ones(2))
+        for x, y in ((detector, windows), (again, 1000.0 * windows + 300.0))
     )
+    np.testing.assert_allclose(found, same, atol=1e-4)
 
 
-def test_a_window_of_the_wrong_shape_raises_an_error_that_names_it(trained):
-    _, detector, _ = trained
-    with pytest.raises(ValueError, match="window"):
-        detectors.detect(detector, jnp.zeros(5))
+def test_wrong_shapes_are_named(trained):
+    for call in (detectors.detect, detectors.features):
+        with pytest.raises(ValueError, match="window"):
+            call(trained[0], jnp.zeros(5), jnp.float32(1.0))
     with pytest.raises(ValueError, match="windows"):
-        detectors.init(jax.random.key(0), jnp.zeros(5), 2, CONFIG)
+        detectors.init(KEY, jnp.zeros(5), 2, CONFIG)
 
 
-def test_few_windows_teach_an_offset_and_keep_what_was_learned(trained):
-    detector = trained[1]
-    windows, labels = synthetic_windows(jax.random.key(5), 200)
-    others, of_others = synthetic_windows(jax.random.key(6), 2000)
-    before = accuracy(detector, others, of_others)
-    assert before > 0.99
+# The first reading is the log-odds of a window, less the distance beyond 1 m; the second is the
+# logit of a label.
+READ = [[0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 0, 0]]
+search = jax.jit(detectors.search)
+
+
+def test_a_search_of_one_window_is_a_look(problem):
+    windows = some_looks(KEY, 2)[0].windows
+    for window in (windows[0], windows[1].at[1].set(jnp.nan)):
+        plain = detect(problem.detector, window, jnp.float32(1.0))
+        found = search(problem.detector, window[None], jnp.ones(1), jnp.zeros((1, 1)))
+        assert found.is_there == plain.is_there
+        np.testing.assert_allclose(found.features, plain.features, atol=1e-6)
+
+
+def test_a_search_pools_the_windows_by_their_posterior_odds():
+    detector = linear(READ, [0, 0, 1], threshold=1.5)
+    windows = jnp.array([[2.0, 3.0], [2.0, -1.0], [9.0, 5.0], [np.nan, 5.0]])
+    prior = jnp.array([0.0, -np.log(3.0), -np.inf, 0.0])
+    found = search(detector, windows, jnp.array([1.0]), prior[None])
+    # Shares 3/4 and 1/4: a logit of 3 x .75 - 1 x .25 = 2, and the sigmoid of 2 is .8808.
+    assert found.is_there
+    np.testing.assert_allclose(found.features, [0.8808, 0.1192], atol=1e-3)
+    # Log-odds of 2 and, at the other distance, of 2 - x: a mean of 2 - log 2 + log(1 + e^-x), which
+    # is 1.5 for x = 1.55. A distance that is not positive is none, and has no share in the mean.
+    for distances, is_there in (
+        *(([1.0, 2.5], True), ([1.0, 2.6], False), ([1.0, -1.0], True), ([1.0, np.nan], True)),
+        ([-1.0, np.nan], False),
+    ):
+        found = search(detector, windows, jnp.array(distances), jnp.tile(prior, (2, 1)))
+        assert bool(found.is_there) is is_there
+        assert is_there or found.features.tolist() == [0.5, 0.5]
+    assert not search(detector, windows, jnp.ones(1), jnp.full((1, 4), -jnp.inf)).is_there
+
+
+def test_a_search_takes_no_window_for_impossible():
+    # Certain of one label in one window, and of the other in the next.
+    windows = jnp.array([[2.0, 200.0], [2.0, -200.0]])
+    found = search(linear(READ, [0, 0, 1]), windows, jnp.ones(1), jnp.zeros((1, 2)))
+    np.testing.assert_allclose(found.features, [0.5, 0.5], atol=1e-6)
+
+
+def test_few_looks_teach_an_offset_and_keep_what_was_learned(trained):
+    detector = trained[0]
+    (few, labels), (others, of_others) = (some_looks(jax.random.key(5 + i), 200) for i in range(2))
     # Where there is nothing to learn, nothing is forgotten.
-    same = retrain(jax.random.key(7), detector, windows, labels)
-    assert accuracy(same, others, of_others) > before - 0.005
-    # Readings that are all too low by more than half of what tells the labels.
-    offset = 0.7
-    assert accuracy(detector, others - offset, of_others) < 0.95
+    same = retrain(jax.random.key(7), detector, few, labels)
+    assert accuracy(same, others, of_others) > accuracy(detector, others, of_others) - 0.005
+    # Readings that are all too low.
+    spoil = lambda looks: replace(looks, windows=looks.windows - 0.6)  # noqa: E731
+    assert accuracy(detector, spoil(others), of_others) < 0.9
     config = replace(CONFIG, calibration=0.25)
-    moved = jax.jit(detectors.retrain)(
-        jax.random.key(7), detector, windows - offset, labels, config
-    )
-    assert accuracy(moved, others - offset, of_others) > 0.99
-    jax.tree.map(np.testing.assert_array_equal, moved.gate, detector.gate)
+    moved = jax.jit(detectors.retrain)(jax.random.key(7), detector, spoil(few), labels, config)
+    assert accuracy(moved, spoil(others), of_others) > 0.97
+    np.testing.assert_array_equal(detector.of(others)[-1], moved.of(others)[-1])
 
 
-def test_retraining_moves_no_farther_than_serves_windows_kept_from_it(trained):
-    # The last quarter of the windows is kept. Labels that are wrong before it teach nonsense.
-    detector = trained[1]
-    windows, labels = synthetic_windows(jax.random.key(8), 200)
+def test_retraining_moves_no_farther_than_serves_looks_kept_from_it(trained):
+    # The last quarter of the looks is kept. Labels that are wrong before it teach nonsense.
+    looks, labels = some_looks(jax.random.key(8), 200)
     wrong = jnp.where(jnp.arange(200) < 150, 1 - labels, labels)
-    same = retrain(jax.random.key(9), detector, windows, wrong)
-    assert accuracy(same, windows, labels) >= accuracy(detector, windows, labels) - 0.01
+    same = retrain(jax.random.key(9), trained[0], looks, wrong)
+    assert accuracy(same, looks, labels) >= accuracy(trained[0], looks, labels) - 0.01
 
 
-@pytest.mark.parametrize("row", [3, 190])  # of the windows to train with, and to judge by
+@pytest.mark.parametrize("row", [3, 190])  # of the looks to train with, and to judge by
 def test_retraining_that_is_not_finite_says_so(trained, row):
-    windows, labels = synthetic_windows(jax.random.key(8), 200)
-    found = retrain(jax.random.key(9), trained[1], windows.at[row, 0].set(jnp.nan), labels)
+    looks, labels = some_looks(jax.random.key(8), 200)
+    spoilt = replace(looks, windows=looks.windows.at[row, 0].set(jnp.nan))
+    found = retrain(jax.random.key(9), trained[0], spoilt, labels)
     assert all(np.isnan(x).all() for x in jax.tree.leaves(found.params))
+    far = replace(looks, windows=5e37 * looks.windows)
     with pytest.raises(ValueError, match=r"^loss of retrained detectors = (nan|inf): must be fin"):
-        detectors.retrain(jax.random.key(9), trained[1], 5e37 * windows, labels)
+        detectors.retrain(jax.random.key(9), trained[0], far, labels)
 
 
 @pytest.mark.parametrize(("calibration", "number"), [(0.0, 10), (0.5, 1)])
-def test_windows_to_train_with_and_to_judge_by_are_needed(trained, calibration, number):
+def test_looks_to_train_with_and_to_judge_by_are_needed(trained, calibration, number):
     config = replace(detectors.RETRAINING, calibration=calibration)
-    detector = trained[1]
-    windows = jnp.zeros((number, len(detector.offset)))
+    looks = Looks(np.zeros((number, RAYS)), np.ones(number))
     with pytest.raises(ValueError, match=f"config.calibration = {calibration}: must leave some of"):
-        detectors.retrain(jax.random.key(0), detector, windows, jnp.zeros(number, int), config)
+        detectors.retrain(KEY, trained[0], looks, np.zeros(number, int), config)
+    with pytest.raises(TypeError, match="detector is a Looks; must be a Classifier"):
+        detectors.retrain(KEY, looks, looks, np.zeros(number, int), config)
 
 
-def test_windows_and_labels_to_retrain_with_may_be_those_of_numpy(trained):
-    windows, labels = synthetic_windows(jax.random.key(5), 40)
-    config = replace(CONFIG, steps=2, calibration=0.25)
-    of_numpy, of_jax = (
-        detectors.retrain(jax.random.key(7), trained[1], *data, config)
-        for data in ((np.array(windows), np.array(labels)), (windows, labels))
-    )
-    jax.tree.map(np.testing.assert_array_equal, of_numpy.params, of_jax.params)
-    with pytest.raises(TypeError, match="detector is a Gate; must be a Classifier"):
-        detectors.retrain(jax.random.key(7), trained[1].gate, windows, labels, config)
+def test_no_product_of_a_search_or_a_value_has_the_precision_of_the_device(problem):
+    values = LookValues(jnp.ones(3), jnp.ones(3), *jnp.ones(2), jnp.ones((4, 2)))
+    windows = problem.shown.windows[:20]
+    for traced in (
+        jax.make_jaxpr(detectors.search)(problem.detector, windows, jnp.ones(2), jnp.ones((2, 20))),
+        jax.make_jaxpr(values.of_next)(jnp.full(4, 0.25), jnp.bool_(True)),
+    ):
+        products = re.findall(r"dot_general\[(.*?)\] ", str(traced), re.DOTALL)
+        assert products
+        assert all("precision=(Precision.HIGHEST" in each for each in products), products

@@ -29,12 +29,6 @@ def cylinder(distance, bearing, radius=0.1, wall=3.0):
     return jnp.asarray(np.where(hit, ranges, wall), jnp.float32)
 
 
-def test_angles_are_those_of_the_window():
-    assert ANGLES.shape == (LIDAR.window,)
-    np.testing.assert_allclose(np.diff(ANGLES), np.diff(LIDAR.angles)[:127], atol=1e-6)
-    np.testing.assert_allclose(ANGLES.mean(), 0, atol=1e-6)
-
-
 def test_a_cylinder_has_the_depth_of_a_circle():
     found = np.asarray(PROFILE(cylinder(0.5, 0.0)))
     inside = np.abs(PLACES) < 0.08
@@ -71,32 +65,12 @@ def test_chromaticity_keeps_colour_and_drops_the_light():
     np.testing.assert_allclose(half, [bright, dark], rtol=0.06)
 
 
-def test_other_sensors_are_seen_as_they_are():
-    window = jnp.arange(4.0)
-    np.testing.assert_array_equal(frames.make(np.zeros(4), 1, False, 0.1, 0.0)(window), window)
-    for angles, channels in ((np.zeros(4), 2), (np.array([0.0, 0.1]), 1)):
-        assert isinstance(frames.make(angles, channels, True, 0.1, 0.0), frames.Plain)
-
-
 def test_scaling_standardises_by_the_training():
     windows = 3.0 + 2.0 * jax.random.normal(jax.random.key(0), (500, 4))
     scaling, seen = frames.scaled(frames.Plain(), windows)
     np.testing.assert_allclose(seen.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(seen.std(), 1, rtol=1e-3)
     np.testing.assert_allclose(jax.vmap(scaling)(windows), seen, rtol=1e-4, atol=1e-5)
-
-
-def test_a_profile_grows_with_the_poi():
-    twice = frames.make(ANGLES, 1, True, 2 * EXTENT, 0.0)
-    small, large = cylinder(0.5, 0.0), cylinder(1.0, 0.0, radius=0.2, wall=6.0)
-    np.testing.assert_allclose(twice(large), 2 * PROFILE(small), atol=1e-5)
-
-
-def test_few_beams_leave_no_gaps():
-    few = frames.make(ANGLES[::6], 1, True, EXTENT, 0.0)
-    inside = np.abs(PLACES) < 0.07
-    found = few(cylinder(1.0, 0.0)[::6])[inside]
-    np.testing.assert_allclose(found, PROFILE(cylinder(1.0, 0.0))[inside], atol=0.02)
 
 
 def test_the_front_is_sought_as_far_as_the_bearing_may_be_wrong():

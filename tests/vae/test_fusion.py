@@ -2,7 +2,6 @@
 
 import inspect
 import itertools
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -62,16 +61,6 @@ def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others(mode
             assert_same(belief, encode(params, model, tuple(inputs)))
 
 
-@pytest.mark.parametrize("modality", [0, 1])
-def test_a_first_look_gives_the_uni_modal_posterior_whatever_the_belief_was(modality):
-    params, new = init(jax.random.key(0), TWO), look(TWO, modality)
-    alone = tuple(new if m == modality else None for m in range(2))
-    for own in (False, True):  # a second look with the same sensor starts afresh
-        seen = (jnp.arange(2) == modality) & own
-        belief = update(in_place(TWO, params), OLD, seen, new, modality=modality)
-        assert_same(belief, encode(params, TWO, alone))
-
-
 def test_several_sensors_may_look_at_once():
     # What has looked before and does not look now is decoded; all the others are as they are.
     params = init(jax.random.key(0), THREE)
@@ -87,42 +76,6 @@ def test_several_sensors_may_look_at_once():
         fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (None, None, None))
     with pytest.raises(ValueError, match="must be 3, one for each"):
         fusion.fuse(params, THREE, OLD, jnp.zeros(3, bool), (camera, None))
-
-
-def test_fusion_decodes_the_mean_and_ignores_the_width_of_the_old_belief():
-    params, new = init(jax.random.key(0), TWO), look(TWO, 1)
-    seen = jnp.array([True, False])
-    belief = update(in_place(TWO, params), OLD, seen, new, modality=1)
-    camera, _ = decode(params, TWO, OLD.mean)
-    assert_same(belief, encode(params, TWO, (camera, new)))
-    wider = update(in_place(TWO, params), replace(OLD, std=5 * OLD.std), seen, new, modality=1)
-    np.testing.assert_array_equal(wider.mean, belief.mean)
-    moved = update(in_place(TWO, params), replace(OLD, mean=OLD.mean + 1), seen, new, modality=1)
-    assert np.all(moved.mean != belief.mean)
-
-
-def test_a_batch_of_updates_equals_a_loop_of_singles_in_any_order():
-    params = init(jax.random.key(0), TWO)
-    mean, std = jax.random.normal(jax.random.key(1), (2, 6, 2))
-    old = Belief(mean, jnp.abs(std))
-    seen = jnp.array([[0, 0], [0, 1], [1, 0], [1, 1], [0, 1], [1, 0]], bool)
-    new = jax.nn.softmax(jax.random.normal(jax.random.key(2), (6, 2)))
-
-    @jax.jit
-    @jax.vmap
-    def together(old, seen, new):
-        return update(in_place(TWO, params), old, seen, new, modality=0)
-
-    batch = together(old, seen, new)
-    for i in range(6):
-        single = update(
-            in_place(TWO, params), Belief(old.mean[i], old.std[i]), seen[i], new[i], modality=0
-        )
-        np.testing.assert_allclose(batch.mean[i], single.mean, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(batch.std[i], single.std, rtol=1e-5)
-    order = np.array([3, 5, 0, 1, 4, 2])
-    permuted = together(Belief(old.mean[order], old.std[order]), seen[order], new[order])
-    np.testing.assert_allclose(permuted.mean, batch.mean[order], rtol=1e-5, atol=1e-6)
 
 
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
@@ -156,17 +109,6 @@ def test_a_prior_has_mean_zero_and_the_given_variance():
     belief = fusion.prior(TWO, 20.0)
     np.testing.assert_array_equal(belief.mean, [0.0, 0.0])
     np.testing.assert_allclose(belief.std, [4.472136, 4.472136], rtol=1e-6)  # sqrt(20)
-
-
-def test_wrong_shapes_raise_errors_that_name_the_argument():
-    params, new = init(jax.random.key(0), TWO), look(TWO, 0)
-    seen = jnp.array([False, False])
-    with pytest.raises(ValueError, match="belief"):
-        in_place(TWO, params).update(Belief(jnp.zeros((1, 2)), jnp.ones((1, 2))), seen, new, 0)
-    with pytest.raises(ValueError, match="seen"):
-        update(in_place(TWO, params), OLD, jnp.array([False]), new, modality=0)
-    with pytest.raises(ValueError, match="features of camera"):
-        update(in_place(TWO, params), OLD, seen, jnp.zeros(3), modality=0)
 
 
 @pytest.mark.parametrize("modality", [-1, 2, 3])

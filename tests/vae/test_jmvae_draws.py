@@ -1,7 +1,5 @@
 """What a JMVAE is trained on: which detections are drawn from a bank."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -66,21 +64,3 @@ def test_a_bank_with_a_gap_is_named():
     gap[2, 3] = np.nan
     with pytest.raises(ValueError, match="bank of lidar = nan: must be finite"):
         jmvae.train(jax.random.key(0), {}, MODEL, (CAMERA, gap), SETTINGS)
-
-
-def test_missing_weights_are_counted():
-    params, settings = jmvae.init(jax.random.key(0), MODEL), JmvaeConfig(steps=1, batch=1)
-    settings = dataclasses.replace(settings, reconstruction_weights=(1.0,))
-    train, expected = jax.jit(jmvae.train, static_argnums=2), "1 entries: must be 2, one for each"
-    with pytest.raises(ValueError, match=f"^reconstruction_weights has {expected}"):
-        train(jax.random.key(0), params, MODEL, (CAMERA, LIDAR), settings)
-
-
-def test_three_modalities_are_drawn_independently():
-    model = jmvae.Jmvae(("camera", "lidar", "thermal"), (1, 2, 2), 2, (3,))
-    problem = jmvae.Fitting(SETTINGS, (CAMERA, LIDAR, LIDAR), model)
-    _, features = problem.draw(jax.random.key(0), 20)
-    _, lidar, thermal = (np.asarray(x[:, 0]) for x in features)
-    np.testing.assert_array_equal(lidar // 10, thermal // 10)
-    pairs = set(zip((lidar % 10).ravel().tolist(), (thermal % 10).ravel().tolist(), strict=True))
-    assert len(pairs) == 5 * 5

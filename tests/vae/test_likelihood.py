@@ -41,8 +41,3 @@ def test_few_samples_estimate_too_little_on_average(params):
     keys = jax.random.split(jax.random.key(2), 2000)
     of_one = jax.vmap(lambda key: estimate(key, params, LINEAR, FEATURES, WEIGHTS, samples=1))(keys)
     assert np.mean(of_one) < exact(params, (0, 1)) - 0.05
-
-
-def test_without_samples_it_is_refused(params):
-    with pytest.raises(ValueError, match="samples = 0: must be"):
-        vae.log_likelihood(jax.random.key(0), params, LINEAR, FEATURES, WEIGHTS, samples=0)
