@@ -25,7 +25,6 @@ from .models import init as init
 from .models import make_bayes as make_bayes
 from .models import make_in_place as make_in_place
 from .models import make_jmvae as make_jmvae
-from .recorded.comparing import compare_scans as compare_scans
 from .run.rundir import load as load
 from .run.score import MissionScore as MissionScore
 from .run.score import score_missions as score_missions

@@ -120,7 +120,6 @@ def resample(
     """Resamples recorded scans to the rays of a simulated sensor, see `resampling.resample`.
 
     Args:
-      sensor: the sensor.
       angles: directions of the recorded rays in the robot's frame, in radians, in any order.
       readings: recorded scans, in the units of the sensor.
 

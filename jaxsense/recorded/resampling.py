@@ -34,7 +34,6 @@ def resample(
       targets: `[B]` directions of the rays to read along, in radians.
       angles: `[A]` directions of the recorded rays in the same frame, in radians; two or more.
       readings: `[A, ...]` recorded distances in metres, or other readings.
-      measures_distance: whether readings are distances.
       step: see `covered`.
 
     Raises:
@@ -79,7 +78,6 @@ def close_gaps(
     Args:
       angles: `[A]` directions of the beams, in radians, in any order.
       ranges: `[A]` distances in metres; 0, infinite or NaN without a return.
-      most: beams in a gap.
       step: angle between the rays that are read later, in radians; beams farther apart than
         `MAX_STEPS` of it are no neighbours. By default the median one between beams.
 

@@ -98,7 +98,6 @@ def build(
     """Compiles an arena.
 
     Args:
-      config: sizes and number of PoIs.
       lidar_robots: for each robot, whether it carries a laser scanner, or another sensor on top.
       contacts: whether robots collide with PoIs, with each other and with the walls.
       obstacles: whether there are PoIs and walls.
@@ -186,7 +185,6 @@ def make_layout(
     """Layout of PoIs.
 
     Args:
-      config: the arena.
       position: centres of the PoIs, in metres from the arena's centre.
       yaw: in radians.
       classes: index of each PoI's class in `config.classes`.
@@ -211,8 +209,6 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     own and a position that leaves half the gap free on every side.
 
     Args:
-      key: random key.
-      config: the arena.
       classes: index of each PoI's class in `config.classes`.
     """
     per_side = min(
@@ -239,8 +235,6 @@ def place(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
     `mjx.kinematics`, which follows chains of joints, is a program of 36 times as many operations.
 
     Args:
-      arena: the arena.
-      layout: the PoIs.
       poses: x [m], y [m] and yaw [rad] of each robot.
     """
     data = put(arena, layout, poses)
@@ -287,8 +281,6 @@ def drive(arena: Arena, data: mjx.Data, wheel_speeds: Float[Array, "R 2"]) -> mj
     """Advances the physics by `TIMESTEP` seconds.
 
     Args:
-      arena: the arena.
-      data: the MJX state.
       wheel_speeds: left and right wheel speed of each robot, in rad/s.
     """
     chex.assert_shape(wheel_speeds, (arena.num_robots, 2))

@@ -95,7 +95,6 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
     """Draws a light of random strength from any side, 20 to 70 degrees above the floor.
 
     Args:
-      key: random key.
       has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
     """
     light_key, condition_key = jax.random.split(key)
@@ -121,7 +120,6 @@ def lighting(
     Args:
       values: of the light's conditions where and when the camera looks.
       place: of the pixels in the whole image, from 0 at its left to 1 at its right.
-      config: settings of the camera.
 
     Returns:
       Factors on the brightness of red, green and blue, and for each pixel 1 where the distant light

@@ -55,18 +55,16 @@ class Fan:
     field_of_view: float
 
     @property
-    def _half(self) -> float:
-        return float(np.radians(self.field_of_view)) / 2
-
-    @property
     def angles(self) -> Float[np.ndarray, "B"]:
         """See `Rays.angles`."""
-        first = -self._half if self.num_rays > 1 else 0.0
-        return np.linspace(first, self._half, self.num_rays, dtype=np.float32)
+        half = float(np.radians(self.field_of_view)) / 2
+        first = -half if self.num_rays > 1 else 0.0
+        return np.linspace(first, half, self.num_rays, dtype=np.float32)
 
     def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
         """See `Rays.centre`."""
-        return (bearing - self.angles[0]) / (2 * self._half / max(self.num_rays - 1, 1))
+        step = float(np.radians(self.field_of_view)) / max(self.num_rays - 1, 1)
+        return (bearing - self.angles[0]) / step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +80,6 @@ class Pinhole:
     field_of_view: float
 
     @property
-    def _middle(self) -> float:
-        return (self.num_pixels - 1) / 2
-
-    @property
     def _focal_length(self) -> float:
         return (self.num_pixels / 2) / float(np.tan(np.radians(self.field_of_view) / 2))
 
@@ -93,11 +87,12 @@ class Pinhole:
     def angles(self) -> Float[np.ndarray, "B"]:
         """See `Rays.angles`."""
         columns = np.arange(self.num_pixels)
-        return np.arctan((self._middle - columns) / self._focal_length).astype(np.float32)
+        middle = (self.num_pixels - 1) / 2
+        return np.arctan((middle - columns) / self._focal_length).astype(np.float32)
 
     def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
         """See `Rays.centre`."""
-        return self._middle - self._focal_length * jnp.tan(bearing)
+        return (self.num_pixels - 1) / 2 - self._focal_length * jnp.tan(bearing)
 
 
 @pytree
@@ -145,7 +140,6 @@ def cross_section(
     Wheels and casters are left out: at the height of a sensor they are inside the robot's cylinder.
 
     Args:
-      arena: the arena.
       data: the arena's MJX state, with up-to-date `geom_xpos` and `geom_xmat`.
       height: height of the cut.
       robot: index of the robot whose geoms to omit, because it is looking; -1 for none.
@@ -187,7 +181,6 @@ def cast(section: CrossSection, origin: Origin, angle: Float[Array | np.ndarray,
     which is not at edges, on tangents and where two outlines are equally far away.
 
     Args:
-      section: the scene.
       origin: start of the rays, in metres.
       angle: directions in the world, in radians.
     """

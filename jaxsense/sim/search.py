@@ -59,8 +59,6 @@ def candidates(
     Errors are independent and normal; the largest ones are three standard deviations.
 
     Args:
-      sensor: the sensor.
-      search: the largest errors.
       window: `[F]` readings of the rays that `widened` reads around the bearing, see `as_window`.
       bearing: at which the robot expects the PoI, in its frame, in radians.
       distance: at which it expects the PoI's centre, in metres.

@@ -82,7 +82,6 @@ class Sensor(abc.ABC):
         """Readings of one scan, `[B, channels]` if there are several channels.
 
         Args:
-          key: random key of the noise.
           hits: `[B]` first hits of the rays: of a whole scan, or of some of its rays, which
             `hits.ray` tells.
           surfaces: colour and attributes of all geoms, for `raycast.choose`.
@@ -178,9 +177,7 @@ def measured_ranges(
     """Ranges that a laser scanner measures, in metres; `max_range` without a return.
 
     Args:
-      key: random key.
       distance: true distances along neighbouring beams, in metres; infinite without a hit.
-      config: settings of the scanner.
     """
     chex.assert_rank(distance, 1)
     met, spread = distance, config.range_noise
@@ -343,12 +340,7 @@ def scan(
     """Readings of a robot's sensor, along all of its rays or some of them.
 
     Args:
-      key: random key of the noise.
-      sensor: the sensor.
-      arena: the arena.
       data: the arena's MJX state, after kinematics.
-      layout: the PoIs, for their surfaces.
-      light: the light.
       robot: index of the robot that carries the sensor and does not see its own body. May be
         traced; a static index saves casting rays at that body.
       directions: unit vectors in the robot's frame; `sensor.directions` for a whole scan. A mixed

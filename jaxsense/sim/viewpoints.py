@@ -28,12 +28,7 @@ def random_viewpoint(
     unobstructed view of the PoI, or the one with the most room if there is none.
 
     Args:
-      key: random key.
-      config: settings of viewpoints.
-      arena: the sizes of arena and PoIs.
-      layout: the PoIs.
       others: positions of the other robots, in metres.
-      poi: index of the PoI to look at.
     """
     chex.assert_shape(others, (None, 2))
     # A single draw, because each use of the random generator takes long to compile.
@@ -116,10 +111,7 @@ def free_room(
       x: of the viewpoints, in metres.
       y: of the viewpoints, in metres.
       clearance: free space that a robot needs around it, in metres.
-      arena: the sizes of arena and PoIs.
-      layout: the PoIs.
       others: positions of the other robots, in metres.
-      poi: index of the PoI to look at.
     """
     reach = amiro.BODY_RADIUS + clearance
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - reach

@@ -46,7 +46,6 @@ def cut_out(
     """Cuts the detector's input, a window, out of a whole scan, recorded or simulated.
 
     Args:
-      sensor: the sensor.
       readings: of all rays: a LiDAR's in metres from right to left, a camera's as linear RGB in
         [0, 1] from left to right.
       bearing: of the PoI in the robot's frame, in radians, positive to the left.

@@ -44,8 +44,6 @@ class Scene:
     """State of one arena: PoIs, light and robot poses, which determine the MJX state.
 
     Attributes:
-      layout: the PoIs.
-      light: the light.
       poses: `[R, 3]` x [m], y [m] and yaw [rad] of each robot.
     """
 
@@ -93,9 +91,6 @@ def random_scene(
     """Draws a scene under random light, each robot at a random viewpoint of a random PoI.
 
     Args:
-      key: random key.
-      world: the simulation.
-      classes: index of each PoI's class in the settings of the arena.
       places: random key of the PoIs' positions and directions, with which several scenes show the
         same PoIs; part of `key` by default.
     """
@@ -118,11 +113,7 @@ def look(
     Casts only the rays that it needs; readings have the distribution of those of a whole scan.
 
     Args:
-      key: random key.
-      world: the simulation.
-      scene: the current scene.
       robot: index of the robot and of its modality; static.
-      poi: index of the PoI.
 
     Returns:
       The detector's input and the expected distance of the PoI in metres, and the scene with the
@@ -200,9 +191,6 @@ def scan_around(
     """Readings of the rays that the detector reads around a bearing, from a robot's current pose.
 
     Args:
-      key: random key of the noise.
-      world: the simulation.
-      scene: the scene.
       data: the scene's MJX state, from `place`.
       robot: index of the robot, which may be traced.
       bearing: of the window's centre in the robot's frame, in radians.
@@ -228,9 +216,6 @@ def survey(
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
-      key: random key.
-      world: the simulation.
-      classes: index of each PoI's class in the settings of the arena.
       is_empty: whether no look shows its PoI, see `absence.without_poi`; all do by default.
       places: see `random_scene`.
 

@@ -6,13 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import save_models
 
-import jaxsense
-from jaxsense import sim
+from jaxsense import recorded, sim
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.recorded import comparing
-from jaxsense.run.rundir import RunDirectory, Settings
 
 SMOKE = PRESETS["smoke"]
 # Without noise, the error of the bearing alone tells windows apart.
@@ -97,41 +94,34 @@ def simulated(number=8):
 
 
 @pytest.mark.slow
-def test_recordings_are_compared_with_simulated_windows(tmp_path, monkeypatch):
+def test_recordings_are_compared_with_simulated_windows(monkeypatch):
     monkeypatch.setattr(comparing, "NUM_SIMULATED", 24)
-    run, path, content = tmp_path / "run", tmp_path / "recorded.npz", simulated()
-    with RunDirectory.create(run, Settings("smoke", 0, CONFIG)) as created:
-        save_models(created, jaxsense.init(jax.random.key(0), CONFIG))
-    np.savez(path, **content)
-    found = jaxsense.compare_scans(run, path)
-    assert [*found.of_sensors] == ["camera", "lidar"]
-    for pairs in found.of_sensors.values():
+    content = simulated()
+    scans, poses = (
+        {name: content[f"{name}_{part}"] for name in CONFIG.modalities}
+        for part in ("scans", "poses")
+    )
+    found = recorded.compare(CONFIG, recorded.RecordedLooks(content["places"], poses, scans))
+    assert [*found] == ["camera", "lidar"]
+    apart = {
+        n: [np.median(comparing.root_mean_square(x)) for x in (f.residuals, f.usual)]
+        for n, f in found.items()
+    }
+    for name, (recording, usual) in apart.items():
         # A simulated recording is as far from simulated windows as they are from each other.
-        recorded, usual = pairs.apart
-        assert len(pairs.recorded) == 8
-        assert 0 < recorded < 1.5 * usual
+        assert len(found[name].recorded) == 8
+        assert 0 < recording < 1.5 * usual
     # Each beam is off by .01 m, and so is each of the windows that it is compared with.
-    assert found.of_sensors["lidar"].apart[0] == pytest.approx(0.0125, abs=0.003)
-    assert found.picture == path.with_name("recorded.npz.svg")
-    assert found.picture.read_bytes().startswith(b"<?xml")
-    camera, lidar = str(found).splitlines()
-    assert camera.startswith("camera: 8 recorded windows are 0.0")
-    assert lidar.startswith("lidar: 8 recorded windows are 0.01")
-    with pytest.raises(FileExistsError, match=r"recorded\.npz\.svg"):
-        jaxsense.compare_scans(run, path)
+    assert apart["lidar"][0] == pytest.approx(0.0125, abs=0.003)
+    assert str(found["lidar"]).startswith("8 recorded windows are 0.01")
 
     # Another scanner is too far by .2 m, and the last three looks are behind the robot.
-    content = {name: x for name, x in content.items() if not name.startswith("camera")}
-    content["lidar_scans"] = content["lidar_scans"] + 0.2
-    content["lidar_poses"][-3:, 2] += np.pi
-    np.savez(path, **content)
-    found = jaxsense.compare_scans(run, path, tmp_path / "picture.png")
-    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
-    assert [*found.of_sensors] == ["lidar"]
-    assert len(found.of_sensors["lidar"].recorded) == 5
-    assert 0.13 < found.of_sensors["lidar"].apart[0] < 0.22
-    content["lidar_poses"][:-3, 2] += np.pi
-    np.savez(path, **content)
+    far, turned = {"lidar": scans["lidar"] + 0.2}, {"lidar": poses["lidar"].copy()}
+    turned["lidar"][-3:, 2] += np.pi
+    looks = recorded.RecordedLooks(content["places"], turned, far)
+    found = recorded.compare(CONFIG, looks)["lidar"]
+    assert len(found.recorded) == 5
+    assert 0.13 < np.median(comparing.root_mean_square(found.residuals)) < 0.22
+    turned["lidar"][:-3, 2] += np.pi
     with pytest.raises(ValueError, match="lidar_scans: no window around a PoI was recorded"):
-        jaxsense.compare_scans(run, path, tmp_path / "another.svg")
-    assert not list(tmp_path.glob("another*"))
+        recorded.compare(CONFIG, looks)
