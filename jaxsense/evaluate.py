@@ -179,7 +179,7 @@ def _write(
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
-            plot = result_plots.policies(found["mission"], found["num_pois"])
+            plot = result_plots.policies(found["mission"])
             files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]

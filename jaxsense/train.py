@@ -32,7 +32,7 @@ from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import tables, terminal
 from jaxsense.show.terminal import Display, as_text
-from jaxsense.summary import compare, statistics
+from jaxsense.summary import compare
 from jaxsense.summary.blocks import Header, Made
 from jaxsense.summary.read import read_made
 
@@ -321,7 +321,7 @@ def _train_one(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
-    timing, of_each, means = statistics.of_seeds([summary.read(path) for path in paths])
+    timing, of_each, means = compare.of_seeds([summary.read(path) for path in paths])
     made = [(path.name, each) for path in paths for each in read_made(path)]
     seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
     header = _header(run, [*seeds_made, *run.made("means")])
@@ -330,7 +330,7 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = seeds.rewards(paths, run.settings.config, _warn)
     config = run.settings.config
-    _drawing().write(run.path, config, _drawing().of_seeds(config, curves, means), found)
+    _drawing().write(run.path, config, _drawing().of_seeds(curves, means), found)
     rundir.write_json(run.path / "summary.json", found)
 
 

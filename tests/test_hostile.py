@@ -26,11 +26,11 @@ from jaxsense.run.checkpoints import Unfinished
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.show import terminal
-from jaxsense.summary import statistics
+from jaxsense.summary import compare
 
 FEWER = SUMMARY["jmvae"] | {"unambiguous": {"joint": [True]}}
 BLOCKS = {name: SUMMARY[name] for name in RESULTS}
-OF_SEEDS = {**statistics.statistics([BLOCKS, BLOCKS]), "seeds": {"3": BLOCKS, "4": BLOCKS}}
+OF_SEEDS = {**compare.statistics([BLOCKS, BLOCKS]), "seeds": {"3": BLOCKS, "4": BLOCKS}}
 DEEP = '{"a": ' * 100_000 + "1" + "}" * 100_000
 pytestmark = [
     pytest.mark.skipif(sys.platform == "win32", reason="has no FIFO, and no links for everybody"),

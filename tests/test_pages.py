@@ -70,13 +70,3 @@ def test_the_front_page_leads_to_every_page():
         found |= new
     pages = {*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.rst")}
     assert not pages - found
-
-
-def test_dead_links_are_found():
-    page = (
-        "# A `b`, c\n[x](#a-b-c) [`x`](#jaxsense.x) [](../README.md) [x](no.md)\n"
-        "[x](../README.md#quickstart) [x](../README.md#no) [x](https://a.b/c) `[x](y)`\n"
-    )
-    found = [*dead_links(ROOT / "docs" / "index.md", page)]
-    expected = [("code", "#jaxsense.x"), ("", "../README.md"), ("x", "no.md")]
-    assert found == [*expected, ("x", "../README.md#no")]

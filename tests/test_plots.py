@@ -100,29 +100,16 @@ def test_policies_stand_in_rows_by_their_time():
         "camera_alone": case(0.5, 1.0, 20.0),
         "bytes_per_detection": {"latent": 16, "raw": 2000},
     }
-    by_looks, by_time = result_plots.policies(block, 3).axes
+    by_looks, by_time = result_plots.policies(block).axes
     names = [label.get_text() for label in by_looks.get_yticklabels()]
     assert names == ["naive_3", "latent", "random"]  # upwards
-    # Of 3 PoIs in 128 missions.
-    assert [text.get_text() for text in by_time.texts] == [
-        "0.0 % of PoIs wrong (0 of 384)",
-        "2.0 % of PoIs wrong (8 of 384)",
-        "50.0 % of PoIs wrong (192 of 384)",
-    ]
+    wrong = [text.get_text().split(" %")[0] for text in by_time.texts]
+    assert wrong == ["0.0", "2.0", "50.0"]
     assert by_looks.lines[0].get_xdata() == [6.0]
     # A bar for the difference of naive exploration from the latent policy, around its own value.
     (bar,) = by_time.collections
     ((low, high),) = bar.get_segments()
     assert (low.tolist(), high.tolist()) == ([52.0, 0.0], [58.0, 0.0])
-
-
-def test_of_several_seeds_the_bars_are_those_of_the_means():
-    value = {"mean": 2.0, "low": 1.5, "high": 2.5}
-    accuracy = {"mean": 0.98, "low": None, "high": None}
-    ax, by_time = result_plots.policies({"latent": case(accuracy, value, value)}, 3).axes
-    ((low, high),) = ax.collections[0].get_segments()
-    assert (low[0], high[0]) == (1.5, 2.5)
-    assert by_time.texts[0].get_text() == "2.0 % of PoIs wrong"
 
 
 def test_every_arena_and_team_has_a_row_of_times():
@@ -171,26 +158,21 @@ def test_camera_and_lidar_are_drawn_from_left_to_right():
         readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
         readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, -1)
         windows[sensor.name] = sensor.from_left(np.repeat(readings, 3, axis=0))
-    axes = np.reshape(result_plots.scanlines(CONFIG, windows).axes[:6], (2, 3))
-    # Names once for each row and each column.
-    titles = [[ax.get_title() for ax in row] for row in axes]
-    assert titles == [[*CONFIG.arena.classes], [""] * 3]
-    assert [[ax.get_ylabel() for ax in row] for row in axes] == [
-        ["camera", "", ""],
-        ["lidar", "", ""],
-    ]
+    axes = np.reshape(result_plots.scanlines(CONFIG, windows).axes, (3, 2))
+    assert [row[0].get_ylabel() for row in axes] == [*CONFIG.arena.classes]
+    assert [ax.get_title() for ax in axes[0]] == ["camera", "lidar"]
     # The PoI is expected in the middle.
-    for ax, number in zip(axes[:, 0], (CONFIG.camera.window, CONFIG.lidar.window), strict=True):
+    for ax, number in zip(axes[0], (CONFIG.camera.window, CONFIG.lidar.window), strict=True):
         assert ax.lines[-1].get_xdata()[0] == (number - 1) / 2
     # 1.055 * 0.8^(1 / 2.4) - 0.055 = 0.9063 and 1.055 * 0.4^(1 / 2.4) - 0.055 = 0.6652
     pixels = np.asarray(axes[0, 0].images[0].get_array()[0])
     np.testing.assert_allclose(pixels[[0, -1]], [[0.9063] * 3, [0.6652] * 3], atol=1e-4)
     # Near black it is linear: 12.92 * 0.002 = 0.02584.
     np.testing.assert_allclose(colours.as_srgb(np.array([0.0, 0.002, 1.0])), [0, 0.02584, 1])
-    ranges = axes[1, 0].lines[0].get_ydata()
+    ranges = axes[0, 1].lines[0].get_ydata()
     assert ranges[0] > ranges[-1]
     # All distances on one scale.
-    for ax in axes[1]:
+    for ax in axes[:, 1]:
         assert ax.get_ylim() == (0.0, pytest.approx(1.05 * 0.8))
 
 
@@ -225,11 +207,6 @@ def test_classes_are_named_above_their_ellipses_and_seen_where_they_look_alike()
         assert np.abs(points[:, 1] - c).max() < 0.5
 
 
-def test_a_latent_space_of_one_dimension_is_drawn():
-    flat = {n: Belief(b.mean[..., :1], b.std[..., :1]) for n, b in posteriors().items()}
-    latent_plots.latent_space(CONFIG, flat).draw_without_rendering()
-
-
 def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
     paints = {"red": (0.8, 0.1, 0.1), "green": (0.1, 0.7, 0.1), "blue": (0.1, 0.1, 0.8)}
     paints["grey"] = (0.5, 0.5, 0.5)
@@ -252,9 +229,10 @@ def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
         for ax in figure.axes:
             box = ax.get_position()
             assert box.width * width > 2.0
-            assert box.height * height > (0.2 if figure is first else 2.0)
+            assert box.height * height > (0.4 if figure is first else 2.0)
     names = [{text.get_text() for text in ax.texts} for ax in figure.axes[:3]]
-    assert names == [set(classes), set(paints), set(FOUR_SHAPES)]
+    assert names[0] == set(classes)
+    assert names[1] == {f"{paint} cylinder\n{paint} cube\n2 more" for paint in paints}
     assert [ax.get_xlabel() for ax in figure.axes[:3]] == ["latent dimension 4"] * 3
     assert figure.axes[0].get_ylabel() == "latent dimension 7"
     assert not recwarn.list
@@ -277,10 +255,6 @@ ARENAS = {
             for gloss in ("dull", "shiny")
         ),
     ),
-    "two names of black": ArenaConfig(
-        colours={"black": (0.0, 0.0, 0.0), "jet": (0.001, 0.0, 0.0), "white": (1.0, 1.0, 1.0)},
-        classes=("black cube", "jet cube", "black cylinder", "white cube", "white cylinder"),
-    ),
 }
 
 
@@ -297,35 +271,10 @@ def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
     assert found == ["#1ab21a", "#cc1a1a", "#660d0d"]
 
 
-# Linear RGB as those see it who lack one kind of cones (Machado et al. 2009).
-SIGHTS = {
-    "all cones": np.eye(3),
-    "no red": [[0.1523, 1.0526, -0.2049], [0.1145, 0.7863, 0.0992], [-0.0039, -0.0481, 1.0520]],
-    "no green": [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9690]],
-}
-
-
-def lab(colour, sight):
-    """CIE L*a*b* of a colour, as it is seen."""
-    rgb = np.array(to_rgb(colour))
-    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-    seen = np.clip(np.array(sight) @ linear, 0, 1)
-    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-    x, y, z = np.cbrt(np.array(to_xyz) @ seen / [0.9505, 1.0, 1.089])
-    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-@pytest.mark.parametrize("sight", SIGHTS.values(), ids=SIGHTS)
-def test_a_policy_has_one_colour_and_marker_that_all_can_tell_apart(sight):
+def test_policies_and_other_curves_differ_in_colour_and_marker():
     names = [*POLICIES, "my own"]
-    assert len({colours.policy_marker(name) for name in names}) == len(names)
-    seen = [lab(colours.policy_colour(name), sight) for name in names]
-    apart = np.linalg.norm(np.subtract.outer(seen, seen).diagonal(axis1=1, axis2=3), axis=-1)
-    # Some five times what can be noticed.
-    assert apart[np.triu_indices(len(seen), 1)].min() > 13
-
-
-def test_curves_that_belong_to_no_policy_differ_as_policies_do():
+    for style in (colours.policy_colour, colours.policy_marker):
+        assert len({style(name) for name in names}) == len(names)
     styles = [colours.series(number) for number in range(len(POLICIES))]
     for part in ("color", "marker"):
         assert len({style[part] for style in styles}) == len(styles)

@@ -12,7 +12,6 @@ from jaxsense.run import files
 from jaxsense.run.pipeline import Learned, Played
 from jaxsense.show import film, latent_plots, page, result_plots
 from jaxsense.summary import Results, Summary
-from jaxsense.summary.blocks import Learned as Blocks
 
 Pictures: TypeAlias = dict[str, bytes | str]
 """The content of plots and films, by the names of their files."""
@@ -47,9 +46,9 @@ def of_training(config: Config, learned: Learned) -> Pictures:
         "latent_space": latent_plots.latent_space(config, learned.posteriors),
         "scanlines": result_plots.scanlines(config, learned.windows),
         "calibration": result_plots.calibration(config, learned.reliability, belief),
+        "reward": result_plots.rewards(learned.rewards, learned.results["dqn"]),
     }
-    drawn = {f"{name}.svg": svg(figure) for name, figure in figures.items()}
-    return {**drawn, **_of_learning(learned.rewards, learned.results)}
+    return {f"{name}.svg": svg(figure) for name, figure in figures.items()}
 
 
 def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
@@ -64,18 +63,16 @@ def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
         for title, each in films.items()
     ]
     names = (f"{name}.svg" for name in page.OWN_FILMS)
-    plot = svg(result_plots.policies(played.missions, config.arena.num_pois))
+    plot = svg(result_plots.policies(played.missions))
     return {"policies.svg": plot, **dict(zip(names, drawn, strict=False))}
 
 
-def of_seeds(config: Config, curves: result_plots.Curves, results: Results) -> Pictures:
+def of_seeds(curves: result_plots.Curves, results: Results) -> Pictures:
     """The plots of several seeds together: `results` holds means and intervals."""
-    plot = svg(result_plots.policies(results["mission"], config.arena.num_pois))
-    return {**_of_learning(curves, results), "policies.svg": plot}
-
-
-def _of_learning(curves: result_plots.Curves, results: Blocks) -> Pictures:
-    return {"reward.svg": svg(result_plots.rewards(curves, results["dqn"]))}
+    return {
+        "reward.svg": svg(result_plots.rewards(curves, results["dqn"])),
+        "policies.svg": svg(result_plots.policies(results["mission"])),
+    }
 
 
 def write(run: Path, config: Config, pictures: Pictures, found: Summary) -> None:

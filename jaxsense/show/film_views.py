@@ -134,10 +134,6 @@ def _draw_bars(parent: Element, scene: Scene, n: int) -> None:
     for c, colour in enumerate(scene.colours):
         bar = add(group, "rect", x=width * c, width=0.85 * width, fill=colour)
         scene.timeline.animate(bar, "height", heights[:, c])
-    below = y + radius + 15
-    place = {"x": np.clip(x, 26, SIZE - 26), "y": below if below < SIZE - 4 else y - radius - 7}
-    text = add(parent, "text", "unknown", class_="film-unknown film-on-light", **place)
-    scene.timeline.animate(text, "opacity", ~scene.record.seen[:, n].any(axis=-1), jumps=True)
 
 
 def _draw_looks(parent: Element, scene: Scene, r: int) -> None:

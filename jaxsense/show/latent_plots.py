@@ -76,9 +76,11 @@ def _draw_beliefs(ax: Axes, belief: Belief, classes: Sequence[str], colours: Seq
             ax.add_collection(PatchCollection(patches, alpha=0.5, linestyles=[line], **style))
             # Hollow and of another shape, so that classes in one place are all seen.
             ax.scatter(*mean[c].T, s=30, marker=MARKERS[c % len(MARKERS)], linewidths=1.0, **style)
-        first = together[0]
+        first, names = together[0], [classes[c] for c in together]
+        if len(names) > _MANY_TOGETHER:
+            names[_MANY_TOGETHER - 1 :] = [f"{len(names) - _MANY_TOGETHER + 1} more"]
         name = ax.annotate(
-            _named([classes[c] for c in together]),
+            "\n".join(names),
             (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
             (0, 4),
             textcoords="offset points",
@@ -111,12 +113,3 @@ def _groups(centre: np.ndarray, spread: np.ndarray) -> list[list[int]]:
         found.append([c for c, near in zip(waiting, is_near, strict=True) if near])
         waiting = [c for c in waiting if c not in found[-1]]
     return found
-
-
-def _named(classes: Sequence[str]) -> str:
-    """Names of classes below one another, or of many what they have in common."""
-    if len(classes) <= _MANY_TOGETHER:
-        return "\n".join(classes)
-    first, *others = (label.split(" ") for label in classes)
-    shared = [word for word in first if all(word in other for other in others)]
-    return " ".join(shared) or f"{len(classes)} classes"

@@ -18,7 +18,7 @@ from jaxsense.config.options import command
 from jaxsense.core import inside
 from jaxsense.show import tables
 from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
-from jaxsense.summary.metrics import mean
+from jaxsense.summary.blocks import mean
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")
@@ -62,7 +62,6 @@ def render(
         argument=lambda path: shlex.quote(str(path)),
         trust=" --trust" if config.named_code else "",
         summary=summary,
-        order=_order(config),
         remarks=compare.remarks(summary),
         cards=tables.cards(summary),
         missions=[here, *elsewhere],
@@ -124,15 +123,6 @@ def _films(run: Path) -> list[dict[str, Markup]]:
     found = {path.stem: drawing(inside.read(path).decode(errors="replace")) for path in files}
     own = {name: found.pop(name) for name in OWN_FILMS if name in found}
     return [group for group in (own, *({name: x} for name, x in found.items())) if group]
-
-
-def _order(config: Config) -> str:
-    """Who takes which look under the latent policy, see `mission.choice`."""
-    if config.dqn.task == "team" and config.team.tours.steps:
-        return "a second network orders these looks"
-    if config.mission.auctions:
-        return "an auction over travel times divides these looks among the robots"
-    return "robots take the most valuable look first"
 
 
 def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:

@@ -1,31 +1,32 @@
 """The plots of learning and of missions: looks, calibration, the paper's Fig. 5, policies."""
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxsense.config import Config
 from jaxsense.core.types import Reliability
-from jaxsense.show.colours import (
-    MARKERS,
-    SOFT,
-    as_srgb,
-    class_colour,
-    modality_colour,
-    policy_colour,
-    policy_marker,
-)
+from jaxsense.show import colours
+from jaxsense.show.colours import SOFT, policy_colour, policy_marker
 from jaxsense.show.tables import counted
-from jaxsense.summary.blocks import AGENTS, MISSIONS, Agent, Beliefs, Case, Evaluation, Missions
+from jaxsense.summary.blocks import (
+    AGENTS,
+    MISSIONS,
+    Agent,
+    Beliefs,
+    Evaluation,
+    Missions,
+    Number,
+    mean,
+)
 from jaxsense.summary.blocks import cases as cases_of
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.compare import bounds
-from jaxsense.summary.metrics import Number, mean
 
 Arrays = dict[str, np.ndarray]
 Curves = dict[str, Arrays]
@@ -33,8 +34,7 @@ Curves = dict[str, Arrays]
 rewards: `reward` of the exploring policy, and `evaluation` of the learned policy alone on the map,
 NaN where it was not played."""
 
-_COLUMNS = 4  # classes side by side
-_STRIP, _CURVE = 0.3, 1.5  # inches, of a look by a camera and of another one
+_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
 _MIN_LOOKS = 20  # in a bin of the calibration
 _REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
@@ -53,23 +53,14 @@ def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
       windows: for each modality `[C, window, channels]` readings, from left to right.
     """
     classes = config.arena.classes
-    columns = min(len(classes), _COLUMNS)
-    sensors = [*windows] * math.ceil(len(classes) / columns)
-    heights = [_STRIP if windows[name].shape[-1] == 3 else _CURVE for name in sensors]
-    size = (3.0 * columns, sum(heights) + 0.2 * len(sensors) + 0.6)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots(len(heights), columns, squeeze=False, height_ratios=heights)
-    for i, (name, row) in enumerate(zip(sensors, axes, strict=True)):
-        first = i // len(windows) * columns
-        row[0].set_ylabel(name, rotation=0, ha="right", va="center")
-        for c, ax in enumerate(row, first):
-            if c >= len(classes):
-                ax.set_axis_off()
-                continue
-            if i % len(windows) == 0:
-                ax.set_title(classes[c], fontsize=10)
-            _draw_look(ax, windows[name], c, class_colour(config.arena, classes[c]))
-            ax.tick_params(labelleft=c == first)
+    figure = Figure(figsize=(9, _ROW * len(classes) + 0.8), layout="constrained")
+    axes = figure.subplots(len(classes), len(windows), squeeze=False, sharex="col")
+    for c, (label, row) in enumerate(zip(classes, axes, strict=True)):
+        row[0].set_ylabel(label, rotation=0, ha="right", va="center")
+        for ax, readings in zip(row, windows.values(), strict=True):
+            _draw_look(ax, readings, c, colours.class_colour(config.arena, label))
+    for ax, name in zip(axes[0], windows, strict=True):
+        ax.set_title(name)
     words = "rays of the window, from left to right; distances in metres; dashed: the PoI's bearing"
     figure.supxlabel(words, fontsize=10)
     return figure
@@ -79,7 +70,7 @@ def _draw_look(ax: Axes, readings: np.ndarray, c: int, colour: str) -> None:
     """Draws the look at class c of `[C, window, channels]` readings."""
     values = readings[c]
     if readings.shape[-1] == 3:  # an image
-        ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="none")
+        ax.imshow(colours.as_srgb(values)[None], aspect="auto", interpolation="none")
         ax.set_yticks([])
     else:
         top = 1.05 * np.max(readings, initial=0.0, where=np.isfinite(readings))
@@ -110,7 +101,7 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
         panels.append((f"episodes of the whole {name}", {"reward": of_network["reward"]}, None))
         panels.append((f"{name}: one {alone} robot alone on the map", evaluation, agent))
     figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    axes = figure.subplots(1, len(panels), squeeze=False, sharey="team" not in curves)[0]
     bottom = min(_bottom(agent) for *_, agent in panels if agent is not None)
     for ax, (title, of_panel, agent) in zip(axes, panels, strict=True):
         for kind, values in of_panel.items():
@@ -122,12 +113,9 @@ def rewards(curves: Curves, agents: Mapping[str, Agent]) -> Figure:
                 label += f": {height:.2f}, below" if height < bottom else ""
                 ax.axhline(height, color=policy_colour(name), linestyle=line, label=label)
         ax.set(title=title, xlabel="epoch", ylabel="total reward of an episode")
+        ax.set_ylim(bottom=bottom if agent is not None else None)
         ax.grid(alpha=0.3)
         ax.legend(**_BESIDE)
-    alone = [ax for ax, (*_, agent) in zip(axes, panels, strict=True) if agent is not None]
-    top = max(ax.get_ylim()[1] for ax in alone)
-    for ax in alone:
-        ax.set_ylim(bottom, top)
     return figure
 
 
@@ -176,11 +164,11 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
         is_shown = found.looks >= _MIN_LOOKS  # bins of few looks tell nothing
         confidence, accuracy = found.confidence[is_shown], found.accuracy[is_shown]
         share = found.looks[is_shown] / np.sum(found.looks)
-        style = {"color": modality_colour(i), "marker": MARKERS[i % len(MARKERS)], "markersize": 4}
-        left.plot(confidence, accuracy, label=name, markerfacecolor="none", linewidth=1, **style)
+        colour, marker = colours.modality_colour(i), colours.MARKERS[i % len(colours.MARKERS)]
+        left.plot(confidence, accuracy, marker + "-", color=colour, label=name, markersize=4)
         # Hollow, for most lie on top of each other where detectors are confident.
-        hollow = {"facecolors": "none", "edgecolors": modality_colour(i)}
-        left.scatter(confidence, accuracy, 10 + 300 * share, **hollow)
+        size = 10 + 300 * share
+        left.scatter(confidence, accuracy, size, facecolors="none", edgecolors=colour)
     lowest = 1 / max(len(config.labels(name)) for name in reliability)
     left.set(xlabel="confidence of a detector", ylabel="share of right labels")
     left.set(xlim=(lowest - 0.02, 1.02), ylim=(min(lowest, 0.5) - 0.1, 1.02))
@@ -189,24 +177,18 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
     right.plot(belief["looks"], belief["bayes_nll"], "s--", label="exact Bayes", **style)
     right.set(xlabel="looks", ylabel="NLL of the true class [nats]", yscale="log")
     right.set_xticks(belief["looks"])
-    right.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    right.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    right.yaxis.set_minor_formatter(NullFormatter())
+    _number(right.yaxis)
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend(ncols=3, **_ABOVE)
     return figure
 
 
-def policies(block: Missions, num_pois: int) -> Figure:
+def policies(block: Missions) -> Figure:
     """Looks and time of every policy, the slowest last, with 95% intervals, and its wrong PoIs.
 
     The intervals are of the paired differences from the latent policy; with several seeds, of the
     means.
-
-    Args:
-      block: `mission` of the summary.
-      num_pois: points of interest of a mission.
     """
     played = policies_of(block)
     names = sorted(played, key=lambda name: -mean(played[name]["mean_time_s"]))
@@ -224,22 +206,10 @@ def policies(block: Missions, num_pois: int) -> Figure:
         ax.grid(axis="x", alpha=0.3)
     axes[0].set_yticks(range(len(names)), names)
     for y, name in enumerate(names):
-        if name == "latent":
-            axes[0].get_yticklabels()[y].set(color=policy_colour(name), weight="bold")
-        wrong = _wrong(played[name], num_pois)
+        wrong = f"{100 * (1 - mean(played[name]['accuracy'])):.1f} % of PoIs wrong"
         place = axes[1].get_yaxis_transform()
         axes[1].text(1.02, y, wrong, transform=place, va="center", color=SOFT)
     return figure
-
-
-def _wrong(case: Case, num_pois: int) -> str:
-    """The share of wrong PoIs, and of one seed their number."""
-    share = 1 - mean(case["accuracy"])
-    text = f"{100 * share:.1f} % of PoIs wrong"
-    if isinstance(case["accuracy"], dict):
-        return text
-    number = round(mean(case["episodes"]) * num_pois)
-    return f"{text} ({round(share * number):,} of {number:,})"
 
 
 def _error(value: Number, difference: Number | None) -> list[list[float]] | None:
@@ -273,9 +243,7 @@ def places(evaluations: Iterable[Evaluation]) -> Figure:
         ax.plot(times, rows, marker, color=colour, label=policy, markerfacecolor="none")
     ax.set_yticks(range(len(names)), names)
     ax.set(xlabel=MISSIONS["time_s"].label, xscale="log", ylim=(-0.7, len(names) - 0.3))
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
+    _number(ax.xaxis)
     ax.grid(alpha=0.3)
     ax.legend(**_BESIDE)
     return figure
@@ -283,3 +251,10 @@ def places(evaluations: Iterable[Evaluation]) -> Figure:
 
 def _place(found: Evaluation) -> str:
     return f"{found['num_pois']} PoIs in {found['side']:g} m: {counted(found['robots'])}"
+
+
+def _number(axis: Axis) -> None:
+    """Writes plain numbers to a logarithmic axis."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())

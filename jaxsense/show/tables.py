@@ -5,10 +5,22 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from jaxsense.config import ConfigError
 from jaxsense.mission import is_fault
-from jaxsense.summary import Case, Metric, Missions, Results, Timing, cases
-from jaxsense.summary.blocks import AGENTS, BELIEF, DETECTORS, JMVAE, MISSIONS, STAGES, policies
+from jaxsense.summary import Case, Missions, Results, cases
+from jaxsense.summary.blocks import (
+    AGENTS,
+    BELIEF,
+    DETECTORS,
+    JMVAE,
+    MISSIONS,
+    STAGES,
+    Metric,
+    Number,
+    Timing,
+    mean,
+    policies,
+    text,
+)
 from jaxsense.summary.compare import AS_ACCURATE
-from jaxsense.summary.metrics import Number, mean, text
 
 # Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
 _PAPER_CLASSES = {"green cylinder", "red cylinder", "red cube"}
@@ -130,14 +142,16 @@ def failures(block: Missions) -> Table:
     return _missions(failing, "The latent policy, with a robot that is alone, stops or goes blind")
 
 
-_AGAINST = {"against naive": "Difference of the median time from that of naive exploration."}
+_CAPTIONS = {
+    "": "Maps, looks and time",
+    "calibration": "Calibration of the maps",
+    "intervals": "Difference from the latent policy in the same arenas, with 95 % intervals",
+    "of_naive": "Ratio to naive exploration of the same accuracy",
+}
 _UNFINISHED = {
     "unfinished": (
-        "Number of missions that did not end because every robot chose to. `time limit`: "
-        "after `mission.time_limit`; `unreachable`: a robot gave up a PoI that it could not get "
-        "to; `undetected`: it gave one up after looks that showed nothing; `exhausted`: it left "
-        "one that was still worth a look, because no look would have been new; `robot failed`: the "
-        "others finished; `no robot left`: all failed."
+        "Missions that no robot ended by choice: after `mission.time_limit`, or because a PoI was "
+        "unreachable or showed nothing, no look would have been new, or robots failed."
     ),
     "in bold": "The best value among policies that are as accurate as the best one.",
 }
@@ -154,7 +168,7 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
     columns, meanings = [*table.columns, "unfinished"], {**table.meanings, **_UNFINISHED}
     if "naive" in played:
         columns.insert(3, "against naive")
-        meanings |= _AGAINST
+        meanings["against naive"] = "Difference of the median times."
         for (_, texts), case in zip(rows, played.values(), strict=True):
             texts.insert(3, _percent(case["time_s"], played["naive"]["time_s"]))
     values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
@@ -175,26 +189,13 @@ def _best(values: list[list[float]]) -> frozenset[tuple[int, int]]:
     return frozenset(found)
 
 
-ALL_OF_MISSIONS = {
-    "Maps at the end": ("accuracy", "calibration.accuracy", "calibration.confidence",
-                        "calibration.nll", "information"),
-    "Looks and time": ("observations_per_poi", "time_s", "mean_time_s", "goals_reached_fraction",
-                       "collisions", "episodes"),
-    "Difference from the latent policy in the same arenas, with 95 % intervals": (
-        "intervals.accuracy", "intervals.observations_per_poi", "intervals.time_s"),
-    "Ratio to naive exploration of the same accuracy": (
-        "of_naive.observations_per_poi", "of_naive.time_s", "of_naive.mean_time_s"),
-    "A robot alone": ("told", "ambiguous_reported"),
-}  # fmt: skip
-"""The metrics of all tables of `all_of_missions`, by their captions."""
-
-
 def all_of_missions(block: Missions) -> list[Table]:
     """Every metric of every case of a block `mission`, except its seed and how missions ended."""
-    found = [
-        _table(caption, cases(block), [MISSIONS[key] for key in keys])
-        for caption, keys in ALL_OF_MISSIONS.items()
-    ]
+    groups: dict[str, list[Metric]] = {caption: [] for caption in _CAPTIONS.values()}
+    for key, metric in MISSIONS.items():
+        if key not in ("seed", "ended"):
+            groups[_CAPTIONS[key.rpartition(".")[0]]].append(metric)
+    found = [_table(caption, cases(block), metrics) for caption, metrics in groups.items()]
     return [table for table in found if table.rows]
 
 
@@ -209,30 +210,21 @@ def _percent(value: Number, reference: Number) -> str:
 def cards(results: Results) -> list[tuple[str, str, str]]:
     """The main results: a number, its meaning, and figures to compare it with."""
     found, played = [], cases(results["mission"])
-    for key, what, others in (
-        ("observations_per_poi", "looks per PoI", ("naive",)),
-        ("time_s", "median seconds per mission", ("naive",)),
-        ("accuracy", "of PoIs right", ("naive", "random")),
+    for key, what in (
+        ("observations_per_poi", "looks per PoI"),
+        ("time_s", "median seconds per mission"),
+        ("accuracy", "of PoIs right"),
     ):
-        if own := played.get("latent"):
-            beside = [
-                f"{name} {_short(key, played[name][key])}" for name in others if name in played
-            ]
-            if "naive" in played and key != "accuracy":
-                beside.append(_percent(own[key], played["naive"][key]))
-            found.append((_short(key, own[key]), what, ", ".join(beside)))
+        number = {name: mean(case[key]) for name, case in played.items()}
+        shown = {name: text(value, MISSIONS[key].digits) for name, value in number.items()}
+        beside = [f"{name} {shown[name]}" for name in ("naive", "random") if name in played]
+        if "latent" in played:
+            found.append((shown["latent"], what, ", ".join(beside)))
     for modality, agent in results["dqn"].items():
         if agent["optimal_states"] is not None:  # with an optimum to compare with
             what = f"of {mean(agent['num_states']):,.0f} states of the map played optimally"
             found.append((f"{mean(agent['optimal_states']):,.0f}", what, modality))
     return found
-
-
-def _short(key: str, value: Number) -> str:
-    """A metric of missions on a card, without its interval; shares in percent."""
-    if key == "accuracy":
-        return f"{100 * mean(value):.1f}\u00a0%"
-    return text(mean(value), MISSIONS[key].digits)
 
 
 def times(results: Results, timing: Timing) -> list[Table]:

@@ -20,7 +20,6 @@ from jaxsense.show.tables import Table
 
 _LINE_PERIOD = 5.0  # s
 _ENDLESS = 10_000  # columns of a file or a pipe, where nothing is cut
-_WIDE = 110  # columns of a terminal, enough for a bar
 
 
 class Display:
@@ -37,15 +36,13 @@ class Display:
         self._tasks: dict[str, progress.TaskID] = {}
         self._last: dict[str, float] = {}
         self._begin = time.perf_counter()
-        columns = [
+        columns = (
             progress.TextColumn("{task.description}", table_column=Column(min_width=15)),
-            progress.BarColumn(),
+            progress.BarColumn(10),
             progress.MofNCompleteColumn(),
             progress.TimeRemainingColumn(),
             progress.TextColumn("{task.fields[metrics]}"),
-        ]
-        if console.width < _WIDE:
-            del columns[1]
+        )
         is_live = console.is_terminal and not quiet
         self._progress = progress.Progress(*columns, console=console, disable=not is_live)
 

@@ -9,13 +9,10 @@ from jaxsense.summary.blocks import Missions as Missions
 from jaxsense.summary.blocks import Origin as Origin
 from jaxsense.summary.blocks import Results as Results
 from jaxsense.summary.blocks import Summary as Summary
-from jaxsense.summary.blocks import Timing as Timing
 from jaxsense.summary.blocks import cases as cases
-from jaxsense.summary.blocks import traffic as traffic
 from jaxsense.summary.make import agent as agent
 from jaxsense.summary.make import beliefs as beliefs
 from jaxsense.summary.make import jmvae as jmvae
 from jaxsense.summary.make import missions as missions
-from jaxsense.summary.metrics import Metric as Metric
 from jaxsense.summary.read import read as read
 from jaxsense.summary.read import read_evaluations as read_evaluations

@@ -5,12 +5,71 @@ stands in place of each number.
 """
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
 
 from jaxsense.mission import is_fault
-from jaxsense.summary.metrics import Interval, Metric
+
+
+class Interval(TypedDict):
+    """A mean and its 95% interval by Student's t; a single value has no interval."""
+
+    mean: float
+    low: float | None
+    high: float | None
+
+
+Maybe = float | None
+Number = float | Interval
+"""A number of a run, or the mean and the interval of several seeds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Metric:
+    """One value of a block.
+
+    Attributes:
+      label: its name.
+      meaning: what it measures; empty if the label is enough.
+      digits: after the point.
+      key: its place in the block, which names it; a dot leads into an inner block.
+    """
+
+    label: str
+    meaning: str = ""
+    digits: int = 3
+    key: str = ""
+
+    def value(self, block: Mapping[str, object]) -> object:
+        """Its value in a block; None if there is none."""
+        value: object = block
+        for part in self.key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        return value
+
+    def text(self, block: Mapping[str, object]) -> str:
+        """Its value in a block as text, see `text`."""
+        return text(self.value(block), self.digits)
+
+
+def mean(value: Number) -> float:
+    """A number, or the mean of several seeds."""
+    return value if isinstance(value, int | float) else value["mean"]
+
+
+def text(value: object, digits: int = 3) -> str:
+    """A number, with its interval, which no line breaks, if it has one; a hyphen for None.
+
+    Whole numbers have no digits after the point.
+    """
+    if isinstance(value, Mapping):
+        middle, low, high = (text(value.get(name), digits) for name in ("mean", "low", "high"))
+        return middle if low == "-" else f"{middle} ({low}\u00a0to\u00a0{high})"
+    if isinstance(value, float):
+        return f"{round(value, digits) + 0.0:,.{digits}f}"  # no "-0.00"
+    return f"{value:,}" if isinstance(value, int) else "-"
+
 
 PerClass = dict[str, list[float]]
 """For `joint` and for each modality `[C]` numbers, in the order of `arena.classes`."""
@@ -24,99 +83,47 @@ class StageTiming(TypedDict):
 
 
 class Timing(TypedDict):
-    """`timing`."""
+    """`timing`; stages overlap."""
 
-    total_s: Annotated[
-        float,
-        Metric("total time [s]", "Duration of the command after its imports; stages overlap.", 1),
-    ]
+    total_s: Annotated[float, Metric("total time [s]", "Duration after imports.", 1)]
     stages: dict[str, StageTiming]
 
 
 class Detector(TypedDict):
-    """`detectors.MODALITY`."""
+    """`detectors.MODALITY`, on looks at held-out scenes."""
 
-    accuracy: Annotated[
-        float, Metric("accuracy", "Share of looks at held-out scenes with the right label.", 4)
-    ]
-    ece: Annotated[
-        float, Metric("calibration error", "Mean gap between confidence and accuracy (ECE).", 4)
-    ]
+    accuracy: Annotated[float, Metric("accuracy", "Share of looks with the right label.", 4)]
+    ece: Annotated[float, Metric("calibration error", "Expected calibration error (ECE).", 4)]
     nll: Annotated[float, Metric("NLL", "Mean -log p of the right label, in nats.", 4)]
 
 
 class Fusion(TypedDict):
     """`jmvae.fusion`: beliefs after one sensor's look and then another's; null with one sensor."""
 
-    accuracy: Annotated[
-        float | None,
-        Metric("fusion: right", "Share of fused beliefs nearest to the right class.", 4),
-    ]
-    mean_error: Annotated[
-        float | None,
-        Metric("fusion: error", "Distance of the mean from the joint belief, in sigmas."),
-    ]
-    std_error: Annotated[
-        float | None,
-        Metric(
-            "fusion: error of sigma", "Mean absolute log-ratio to the sigma of the joint belief."
-        ),
-    ]
+    accuracy: Annotated[Maybe, Metric("fusion: right", "Share of right classes.", 4)]
+    mean_error: Annotated[Maybe, Metric("fusion: error", "From the joint mean, in sigmas.")]
+    std_error: Annotated[Maybe, Metric("fusion: error of sigma", "Log-ratio to the joint one.")]
 
 
 class Grouped(TypedDict):
     """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
 
-    pair: Annotated[
-        float, Metric("right, one look each", "Share of PoIs nearest to the right cluster.", 4)
-    ]
-    all_looks: Annotated[
-        float, Metric("right, all looks", "The same after `jmvae.looks` looks by each sensor.", 4)
-    ]
+    pair: Annotated[float, Metric("right, one look each", "Share nearest to its cluster.", 4)]
+    all_looks: Annotated[float, Metric("right, all looks", "After `jmvae.looks` looks each.", 4)]
 
 
 class Jmvae(TypedDict):
     """`jmvae`: the latent space."""
 
-    active_units: Annotated[
-        int,
-        Metric(
-            "dimensions in use",
-            "Number of latent dimensions that vary between classes; one in the paper.",
-        ),
-    ]
-    sigma_norm: Annotated[
-        PerClass,
-        Metric(
-            "sigma norm", "Mean for each class, with all sensors (`joint`) and with each alone."
-        ),
-    ]
+    active_units: Annotated[int, Metric("dimensions in use", "They vary between classes.")]
+    sigma_norm: Annotated[PerClass, Metric("sigma norm", "By all sensors (`joint`) and by each.")]
     unambiguous: Annotated[
         dict[str, list[bool]],
-        Metric(
-            "unambiguous",
-            "Whether over 90% of looks leave this class, and no other, plausible (Table I).",
-        ),
+        Metric("unambiguous", "Whether over 90% of looks leave only this class (Table I)."),
     ]
-    consistent: Annotated[
-        PerClass,
-        Metric(
-            "consistent",
-            "Share of looks that leave exactly the classes that the sensor cannot distinguish.",
-        ),
-    ]
-    moment_matching_error: Annotated[
-        float,
-        Metric("error of moments", "Distance from the best Gaussian over the classes left open."),
-    ]
-    readout_error: Annotated[
-        float,
-        Metric(
-            "error of the readout",
-            "Nats lost when a belief stores exact probabilities and they are read back.",
-            digits=4,
-        ),
-    ]
+    consistent: Annotated[PerClass, Metric("consistent", "Looks that leave what looks alike.")]
+    moment_matching_error: Annotated[float, Metric("error of moments", "From the best Gaussian.")]
+    readout_error: Annotated[float, Metric("error of the readout", "Nats lost by storing.", 4)]
     fusion: Fusion
     grouped: NotRequired[Grouped]
 
@@ -126,39 +133,21 @@ class Beliefs(TypedDict):
 
     looks: Annotated[list[int], Metric("looks", "Number of looks at the PoI, 1 to 6.")]
     nll: Annotated[list[float], Metric("NLL of the map", "Mean -log p of the true class.")]
-    bayes_nll: Annotated[list[float], Metric("NLL of exact Bayes", "The same with exact Bayes.")]
-    accuracy: Annotated[
-        list[float],
-        Metric("accuracy of the map", "Share of histories with the right most likely class."),
-    ]
-    bayes_accuracy: Annotated[
-        list[float], Metric("accuracy of exact Bayes", "The same with exact Bayes.")
-    ]
-    doubt_correlation: Annotated[
-        float,
-        Metric("sigma and uncertainty", "Correlation of the sigma norm with the exact entropy."),
-    ]
+    bayes_nll: Annotated[list[float], Metric("NLL of exact Bayes")]
+    accuracy: Annotated[list[float], Metric("accuracy of the map")]
+    bayes_accuracy: Annotated[list[float], Metric("accuracy of exact Bayes")]
+    doubt_correlation: Annotated[float, Metric("sigma and uncertainty", "Their correlation.")]
 
 
 Returns = TypedDict(
     "Returns",
     {
-        "return": Annotated[
-            float, Metric("Q-network", "Reward of an episode, without exploration.")
-        ],
-        "optimal": Annotated[
-            float | None, Metric("optimal", "The optimal policy; null if it is unknown.")
-        ],
-        "greedy": Annotated[
-            float, Metric("greedy", "Takes the look with the highest expected gain.")
-        ],
-        "naive": Annotated[
-            float, Metric("naive", "Looks once at each PoI, whatever the map holds.")
-        ],
+        "return": Annotated[float, Metric("Q-network", "Reward without exploration.")],
+        "optimal": Annotated[Maybe, Metric("optimal", "Null if it is unknown.")],
+        "greedy": Annotated[float, Metric("greedy", "Takes the look with the highest gain.")],
+        "naive": Annotated[float, Metric("naive", "Looks once at each PoI.")],
         "random": Annotated[float, Metric("random", "Takes any action.")],
-        "fraction_of_optimal": Annotated[
-            float | None, Metric("of optimal", "Reward as a share of the optimal one.")
-        ],
+        "fraction_of_optimal": Annotated[Maybe, Metric("of optimal", "Share of the optimum.")],
     },
 )
 """Mean rewards of episodes on the map, from random starts."""
@@ -168,7 +157,7 @@ class OneStep(TypedDict):
     """`dqn.MODALITY.one_step`: the reward of the first step, as in the authors' code."""
 
     policy: Annotated[float, Metric("one step: Q-network", "Reward of the first step.")]
-    optimal: Annotated[float | None, Metric("one step: optimal")]
+    optimal: Annotated[Maybe, Metric("one step: optimal")]
     random: Annotated[float, Metric("one step: random")]
 
 
@@ -176,72 +165,39 @@ class Agent(Returns):
     """`dqn.MODALITY`: a robot alone on the map."""
 
     one_step: OneStep
-    optimal_states: Annotated[
-        int | None,
-        Metric("optimal in", "Number of states with a reward within 0.01 of optimal.", 1),
-    ]
-    num_states: Annotated[
-        int, Metric("states", "Number of combinations of classes and looks, or of a sample.", 0)
-    ]
+    optimal_states: Annotated[int | None, Metric("optimal in", "States, within 0.01.", 1)]
+    num_states: Annotated[int, Metric("states", "Combinations of classes and looks.", 0)]
     optimal_permutations: Annotated[int | None, Metric("optimal permutations", digits=1)]
-    num_permutations: Annotated[
-        int, Metric("permutations", "Number of states in which all classes differ.", 0)
-    ]
+    num_permutations: Annotated[int, Metric("permutations", "All classes differ.", 0)]
     other_numbers: NotRequired[
-        Annotated[
-            dict[str, Returns], Metric("other numbers", "Rewards with `evaluation.num_pois` PoIs.")
-        ]
+        Annotated[dict[str, Returns], Metric("other numbers", "With `evaluation.num_pois` PoIs.")]
     ]
-    env_steps: Annotated[
-        int, Metric("steps of training", "Environment steps, over all environments.", 0)
-    ]
-    env_steps_per_s: Annotated[
-        float, Metric("steps per second", "Environment steps per second of training.", 0)
-    ]
+    env_steps: Annotated[int, Metric("steps of training", "Of all environments.", 0)]
+    env_steps_per_s: Annotated[float, Metric("steps per second", "Of training.", 0)]
 
 
 class Differences(TypedDict):
     """`mission.POLICY.intervals`: from the latent policy, arena by arena, with 95% intervals."""
 
-    accuracy: Annotated[
-        Interval, Metric("right, difference", "Difference from `latent`, with 95 % interval.")
-    ]
-    observations_per_poi: Annotated[
-        Interval, Metric("looks, difference", "Difference from `latent` in looks per PoI.", 2)
-    ]
-    time_s: Annotated[Interval, Metric("mean time, difference [s]", "Difference from `latent`.", 1)]
+    accuracy: Annotated[Interval, Metric("right, difference")]
+    observations_per_poi: Annotated[Interval, Metric("looks, difference", "In looks per PoI.", 2)]
+    time_s: Annotated[Interval, Metric("mean time, difference [s]", digits=1)]
 
 
 class OfNaive(TypedDict):
     """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
 
-    observations_per_poi: Annotated[
-        float,
-        Metric("looks, relative to naive", "Ratio to naive exploration with the same accuracy.", 2),
-    ]
-    time_s: Annotated[
-        float, Metric("median time, relative to naive", "The same, of the median times.", 2)
-    ]
-    mean_time_s: Annotated[
-        float, Metric("mean time, relative to naive", "The same, of the mean times.", 2)
-    ]
+    observations_per_poi: Annotated[float, Metric("looks, relative to naive", digits=2)]
+    time_s: Annotated[float, Metric("median time, relative to naive", digits=2)]
+    mean_time_s: Annotated[float, Metric("mean time, relative to naive", digits=2)]
 
 
 class Calibration(TypedDict):
     """`mission.POLICY.calibration`: maps at the end of missions, PoIs that were detected."""
 
-    confidence: Annotated[
-        float | None,
-        Metric(
-            "confidence",
-            "Mean probability of the most likely class; equals the share right if calibrated.",
-        ),
-    ]
-    accuracy: Annotated[
-        float | None,
-        Metric("right, of detected", "Share of detected PoIs whose most likely class is right."),
-    ]
-    nll: Annotated[float | None, Metric("NLL of the maps", "Mean -log p of the true class.")]
+    confidence: Annotated[Maybe, Metric("confidence", "Mean, of the most likely class.")]
+    accuracy: Annotated[Maybe, Metric("right, of detected", "Share of detected PoIs.")]
+    nll: Annotated[Maybe, Metric("NLL of the maps", "Mean -log p of the true class.")]
 
 
 class Case(TypedDict):
@@ -249,33 +205,17 @@ class Case(TypedDict):
 
     accuracy: Annotated[float, Metric("right", "Share of PoIs whose most likely class is right.")]
     observations_per_poi: Annotated[float, Metric("looks per PoI", "Mean number of looks.", 2)]
-    time_s: Annotated[float, Metric("median time [s]", "Median time until all robots are done.", 1)]
-    mean_time_s: Annotated[
-        float,
-        Metric("mean time [s]", "Mean time until all robots are done.", 1),
-    ]
+    time_s: Annotated[float, Metric("median time [s]", "Until all robots are done.", 1)]
+    mean_time_s: Annotated[float, Metric("mean time [s]", "Until all robots are done.", 1)]
     collisions: Annotated[int, Metric("collisions", "Number of control periods with contact.", 0)]
-    goals_reached_fraction: Annotated[
-        float | None, Metric("goals reached", "Share of goals that robots reached.")
-    ]
+    goals_reached_fraction: Annotated[Maybe, Metric("goals reached", "Share of all goals.")]
     information: Annotated[float, Metric("information", "Sum of 1 / sigma norm over the map.", 2)]
     calibration: Calibration
     episodes: Annotated[int, Metric("missions", "Number of missions.", 0)]
     ended: Annotated[dict[str, int], Metric("ends", "Number of missions with each kind of end.")]
-    told: NotRequired[
-        Annotated[
-            float, Metric("right labels", "For a robot alone: share of PoIs with the right label.")
-        ]
-    ]
+    told: NotRequired[Annotated[float, Metric("right labels", "Of a robot alone.")]]
     ambiguous_reported: NotRequired[
-        Annotated[
-            float | None,
-            Metric(
-                "reported as ambiguous",
-                "For a robot alone: share of the PoIs of confusable classes that the map shows as "
-                "ambiguous.",
-            ),
-        ]
+        Annotated[Maybe, Metric("reported as ambiguous", "Share of PoIs of confusable classes.")]
     ]
     seed: NotRequired[Annotated[int, Metric("seed", "Seed of the arenas of an evaluation.")]]
     intervals: NotRequired[Differences]
@@ -286,10 +226,8 @@ class Traffic(TypedDict):
     """`mission.bytes_per_detection`."""
 
     latent: Annotated[float, Metric("bytes in the map", "Size of one belief.", 0)]
-    features: Annotated[
-        float, Metric("bytes of features", "Mean size of a detection's features.", 0)
-    ]
-    raw: Annotated[float, Metric("bytes of a scan", "Mean size of a detection's scan.", 0)]
+    features: Annotated[float, Metric("bytes of features", "Mean, of a detection.", 0)]
+    raw: Annotated[float, Metric("bytes of a scan", "Mean, of a detection.", 0)]
 
 
 TRAFFIC = "bytes_per_detection"
@@ -346,12 +284,8 @@ class Header(Origin):
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
-    origins: NotRequired[
-        Annotated[list[Made], Metric("origins", "Origins of the stages, if several.")]
-    ]
-    seeds: NotRequired[
-        Annotated[dict[str, Results], Metric("seeds", "Results of each of several seeds.")]
-    ]
+    origins: NotRequired[Annotated[list[Made], Metric("origins", "Of the stages, if several.")]]
+    seeds: NotRequired[Annotated[dict[str, Results], Metric("seeds", "Results of each seed.")]]
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 
 

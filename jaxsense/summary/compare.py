@@ -1,25 +1,15 @@
-"""Compares policies that played in the same arenas."""
+"""Compares policies that played in the same arenas, averages seeds, and says what they show."""
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import cast, get_type_hints
 
 import numpy as np
 import scipy.special
 from jaxtyping import PyTree
 
 from jaxsense.mission import is_fault
-from jaxsense.summary.blocks import (
-    Beliefs,
-    Case,
-    Differences,
-    Missions,
-    OfNaive,
-    Origin,
-    Summary,
-    cases,
-    traffic,
-)
-from jaxsense.summary.metrics import Interval, mean
+from jaxsense.summary import blocks
+from jaxsense.summary.blocks import Case, Interval, Missions, Origin, Results, Summary, cases, mean
 
 REFERENCE = "latent"
 """The policy that the others are compared with."""
@@ -38,11 +28,6 @@ _CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
 _AS_FAST = 0.005  # share of a time that does not matter
-_CAUTIONS = {
-    "smoke": (
-        "Preset smoke only checks that everything runs: its policies are not meant to be good."
-    )
-}
 
 
 def bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -62,35 +47,17 @@ def interval(values: np.ndarray) -> Interval:
     return {"mean": float(values.mean()), "low": low, "high": high}
 
 
-def at_most(number: int) -> float:
-    """The share that an event has at most, with 95% confidence, if none of some trials showed it.
-
-    Args:
-      number: of trials, taken as independent.
-    """
-    return 1 - (1 - _CONFIDENCE) ** (1 / number) if number > 0 else 1.0
-
-
-def differences(found: Measured, reference: Measured) -> Differences:
-    """Mean differences of one case from another, arena by arena, with their 95% intervals.
-
-    Args:
-      found: metrics of the case.
-      reference: metrics of the other case, in the same arenas.
-    """
-
-    def of(name: str) -> Interval:
-        return interval(np.asarray(found[name] - reference[name], float))
-
+def differences(found: Measured, reference: Measured) -> blocks.Differences:
+    """Mean differences of one case from another, arena by arena, with their 95% intervals."""
     own, other = (case["is_right"].mean(axis=-1) for case in (found, reference))
-    return {
-        "accuracy": interval(own - other),
-        "observations_per_poi": of("observations_per_poi"),
-        "time_s": of("time_s"),
-    }
+    looks, seconds = (
+        interval(np.asarray(found[name] - reference[name], float))
+        for name in ("observations_per_poi", "time_s")
+    )
+    return {"accuracy": interval(own - other), "observations_per_poi": looks, "time_s": seconds}
 
 
-def of_naive(played: dict[str, Case], name: str) -> OfNaive | None:
+def of_naive(played: dict[str, Case], name: str) -> blocks.OfNaive | None:
     """Compares looks and time of a policy with naive exploration of the same accuracy.
 
     Interpolates linearly between naive exploration with one, two and three looks of each robot at
@@ -113,15 +80,10 @@ def of_naive(played: dict[str, Case], name: str) -> OfNaive | None:
     case, accuracies = played[name], [each["accuracy"] for each in naive]
     if case["accuracy"] < accuracies[0]:
         return None
-
-    def ratio(key: Literal["observations_per_poi", "time_s", "mean_time_s"]) -> float:
-        return float(case[key] / np.interp(case["accuracy"], accuracies, [n[key] for n in naive]))
-
-    return {
-        "observations_per_poi": ratio("observations_per_poi"),
-        "time_s": ratio("time_s"),
-        "mean_time_s": ratio("mean_time_s"),
-    }
+    return blocks.OfNaive(**{
+        key: float(case[key] / np.interp(case["accuracy"], accuracies, [n[key] for n in naive]))
+        for key in blocks.OfNaive.__annotations__
+    })  # fmt: skip
 
 
 def compared(missions: Missions) -> Missions:
@@ -134,15 +96,46 @@ def compared(missions: Missions) -> Missions:
     return found
 
 
-def unsound(block: Beliefs) -> str | None:
-    """Returns a warning if the map knows much less than exact Bayes after the same looks.
+def of_seeds(runs: Sequence[Summary]) -> tuple[blocks.Timing, dict[str, Results], Results]:
+    """The sums of the times of several seeds, the results of each, and their `statistics`."""
+    total: blocks.Timing = {"total_s": sum(run["timing"]["total_s"] for run in runs), "stages": {}}
+    for run in runs:
+        for name, stage in run["timing"]["stages"].items():
+            sums = total["stages"].setdefault(name, {"compile_s": 0.0, "run_s": 0.0})
+            sums["compile_s"] += stage["compile_s"]
+            sums["run_s"] += stage["run_s"]
+    names = get_type_hints(Results)
+    results = {str(run["seed"]): cast(Results, {n: run[n] for n in names}) for run in runs}
+    return total, results, cast(Results, statistics([*results.values()]))
 
-    Args:
-      block: `belief` of a summary.
+
+def statistics(values: Sequence[object]) -> object:
+    """Mean and 95% interval of every number in several results of the same structure.
 
     Returns:
-      A sentence with what to change; None if the negative log-likelihood is at most 1.2 times that
-      of exact Bayes plus 0.01 nats, after any number of looks.
+      The same structure with an `Interval` in place of each number, and None where some result has
+      None. Omits what some result lacks and what is not a number; in a list, None takes its place.
+    """
+    first = next((value for value in values if value is not None), None)
+    if isinstance(first, dict):
+        dicts = [value if isinstance(value, dict) else {} for value in values]
+        names = [name for name in first if all(name in each for each in dicts)]
+        columns = {name: [each[name] for each in dicts] for name in names}
+        found = {name: statistics(column) for name, column in columns.items()}
+        return {name: x for name, x in found.items() if x is not None or None in columns[name]}
+    if isinstance(first, list):
+        lists = [value for value in values if isinstance(value, list)]
+        return [statistics(row) for row in zip(*lists, strict=True)]
+    if isinstance(first, int | float) and None not in values:
+        return interval(np.array(values, float))
+    return None
+
+
+def unsound(block: blocks.Beliefs) -> str | None:
+    """A warning if the map knows much less than exact Bayes after the same looks.
+
+    None if the negative log-likelihood is at most 1.2 times that of exact Bayes plus 0.01 nats,
+    after any number of looks.
     """
     rows = zip(block["looks"], block["nll"], block["bayes_nll"], strict=True)
     of_looks = [(int(mean(looks)), mean(nll), mean(bayes)) for looks, nll, bayes in rows]
@@ -159,14 +152,7 @@ def unsound(block: Beliefs) -> str | None:
 
 
 def differences_of(origins: Sequence[Origin]) -> dict[str, list[str]]:
-    """Code, versions and machines in which origins differ, on whatever days.
-
-    Args:
-      origins: of some figures.
-
-    Returns:
-      By name, the value of each origin.
-    """
+    """The values of code, versions and machines in which origins differ, by name."""
     found = [
         {**each["versions"], **{name: x for name, x in each.items() if name in _MADE_BY}}
         for each in origins
@@ -186,74 +172,55 @@ def several_origins(origins: Sequence[Origin]) -> str | None:
 
 
 def remarks(found: Summary) -> list[str]:
-    """What to keep in mind about all results of a run.
-
-    Args:
-      found: its summary.
-
-    Returns:
-      Sentences. Where results are not meant to be good, none says how to improve them.
-    """
-    caution = _CAUTIONS.get(found["preset"]) or unsound(found["belief"])
+    """Sentences to keep in mind about all results of a run."""
+    caution = unsound(found["belief"])
+    if found["preset"] == "smoke":  # nobody wants to improve it
+        caution = "Preset smoke only checks that everything runs: its policies are not good."
     return [each for each in (several_origins(found.get("origins", ())), caution) if each]
 
 
 def detection_sizes(block: Missions) -> str:
-    """Says how many bytes a detection takes, on average over those of some missions.
-
-    Args:
-      block: `mission` of a summary or of an evaluation.
-    """
-    size = traffic(block)
-    latent, features, raw = (
-        f"{mean(number):,.0f}" for number in (size["latent"], size["features"], size["raw"])
-    )
+    """Says how many bytes a detection takes, on average over those of some missions."""
+    size = blocks.traffic(block)
     return (
-        f"A detection takes {latent} bytes in the map. In these missions it takes, on "
-        f"average over the sensors that made it, {features} bytes as the detector's "
-        f"features and {raw} as a raw scan."
+        f"A detection takes {mean(size['latent']):,.0f} bytes in the map; in these missions, on "
+        f"average {mean(size['features']):,.0f} as features and {mean(size['raw']):,.0f} as a raw "
+        "scan."
     )
 
 
 def verdict(played: dict[str, Case]) -> str | None:
     """Compares the latent policy with naive exploration, and its time with the fastest policy's.
 
-    Args:
-      played: cases in the same arenas.
-
-    Returns:
-      A sentence about median times and, if it differs, one about accuracy; None unless both
-      policies were played.
+    A sentence about median times and, if it differs, one about accuracy; None unless both policies
+    were played.
     """
     if not {REFERENCE, "naive"} <= set(played):
         return None
-    own = played[REFERENCE]
+    accuracy = {name: mean(case["accuracy"]) for name, case in played.items()}
+    ratios = {
+        name: mean(played[REFERENCE]["time_s"]) / mean(case["time_s"])
+        for name, case in played.items()
+    }
 
     def against(name: str) -> str:
-        percent = 100 * (mean(own["time_s"]) / mean(played[name]["time_s"]) - 1)
+        percent = 100 * (ratios[name] - 1)
         if abs(percent) < 100 * _AS_FAST:
-            return "as fast as "
-        return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than "
+            return f"as fast as {name}"
+        return f"{abs(percent):.0f} % {'faster' if percent < 0 else 'slower'} than {name}"
 
-    text = f"By median times, the latent policy is {against('naive')}naive exploration"
-    faster = {
-        name: mean(case["time_s"])
-        for name, case in played.items()
-        if not is_fault(name)
-        and not name.startswith("naive")
-        and mean(case["time_s"]) < (1 - _AS_FAST) * mean(own["time_s"])
-        and mean(case["accuracy"]) > mean(own["accuracy"]) - AS_ACCURATE
-    }
+    text = f"By median times, the latent policy is {against('naive')} exploration"
+    faster = [
+        name
+        for name in played
+        if not (is_fault(name) or name.startswith("naive"))
+        and ratios[name] > 1 / (1 - _AS_FAST)
+        and accuracy[name] > accuracy[REFERENCE] - AS_ACCURATE
+    ]
     if faster:
-        best = min(faster, key=lambda name: faster[name])
-        text += f" (and {against(best)}{best})"
-    right, usual = mean(own["accuracy"]), mean(played["naive"]["accuracy"])
+        text += f" (and {against(max(faster, key=lambda name: ratios[name]))})"
+    right, usual = accuracy[REFERENCE], accuracy["naive"]
     if abs(right - usual) >= AS_ACCURATE:
-        text += (
-            f". It labels {_percent(right)} of the PoIs right, naive exploration {_percent(usual)}"
-        )
+        text += f". It labels {100 * right:.1f}\u00a0% of the PoIs right, naive exploration "
+        text += f"{100 * usual:.1f}\u00a0%"
     return f"{text}."
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.1f}\u00a0%"

@@ -8,17 +8,8 @@ import numpy as np
 from jaxsense.config import Config
 from jaxsense.mission.outcome import REASONS
 from jaxsense.mission.state import Mission
-from jaxsense.summary.blocks import (
-    Agent,
-    Beliefs,
-    Calibration,
-    Case,
-    Jmvae,
-    Missions,
-    Returns,
-    Traffic,
-    cases,
-)
+from jaxsense.summary import blocks
+from jaxsense.summary.blocks import Case, Missions, cases
 from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
 
 _UNAMBIGUOUS = 0.9  # share of looks that leave only the class; above, the class is unambiguous
@@ -26,32 +17,30 @@ _AS_GOOD = 0.01  # tolerance of the reward below the optimum
 _ERROR = 0.01  # of the optimum, as a share of it
 _FLOAT_BYTES = 4
 
+_Rewards = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
-def jmvae(measured: Mapping[str, object]) -> Jmvae:
-    """The block `jmvae`.
 
-    Args:
-      measured: arrays under its keys, with shares of looks under `unambiguous`.
-    """
-    block: Jmvae = jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+def jmvae(measured: Mapping[str, object]) -> blocks.Jmvae:
+    """The block `jmvae` from arrays under its keys, with shares of looks under `unambiguous`."""
+    block: blocks.Jmvae = jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
     for name, shares in block["unambiguous"].items():
         block["unambiguous"][name] = [share > _UNAMBIGUOUS for share in shares]
     return block
 
 
-def beliefs(measured: Mapping[str, jax.Array]) -> Beliefs:
+def beliefs(measured: Mapping[str, jax.Array]) -> blocks.Beliefs:
     """The block `belief` from arrays under its keys."""
     return jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
 
 
 def agent(
     config: Config,
-    rewards: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    rewards: _Rewards,
     is_permutation: np.ndarray,
     seconds: Sequence[float],
-    others: Mapping[int, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    others: Mapping[int, _Rewards],
     has_optimum: bool = True,
-) -> Agent:
+) -> blocks.Agent:
     """One modality's block of `dqn`.
 
     Args:
@@ -66,20 +55,17 @@ def agent(
     """
     num_starts, env_steps = config.evaluation.num_starts, config.dqn.epochs * config.dqn.num_envs
     num_states = len(is_permutation)
-
-    has_optimum &= not _is_exceeded(rewards, num_starts)
-
-    def first(policy: str) -> float:
-        return float(rewards[policy][1][num_states:].mean())
-
+    returns = _returns(rewards, num_starts, has_optimum)
+    has_optimum = returns["optimal"] is not None
+    first = {name: float(of_first[num_states:].mean()) for name, (_, of_first) in rewards.items()}
     missed = (rewards["optimal"][0] - rewards["latent"][0])[:num_states]
     is_optimal = missed <= _AS_GOOD
-    block: Agent = {
-        **_returns(rewards, num_starts, has_optimum),
+    block: blocks.Agent = {
+        **returns,
         "one_step": {
-            "policy": first("latent"),
-            "optimal": first("optimal") if has_optimum else None,
-            "random": first("random"),
+            "policy": first["latent"],
+            "optimal": first["optimal"] if has_optimum else None,
+            "random": first["random"],
         },
         "optimal_states": int(np.sum(is_optimal)) if has_optimum else None,
         "num_states": num_states,
@@ -95,13 +81,15 @@ def agent(
     return block
 
 
-def _returns(
-    rewards: Mapping[str, tuple[np.ndarray, np.ndarray]], num_starts: int, has_optimum: bool
-) -> Returns:
+def _returns(rewards: _Rewards, num_starts: int, has_optimum: bool) -> blocks.Returns:
     """Mean total rewards from random starts, the last ones."""
-    of = {name: float(total[-num_starts:].mean()) for name, (total, _) in rewards.items()}
-    is_optimum = has_optimum and not _is_exceeded(rewards, num_starts)
-    optimal = of["optimal"] if is_optimum else None
+    totals = {name: total[-num_starts:] for name, (total, _) in rewards.items()}
+    of = {name: float(total.mean()) for name, total in totals.items()}
+    # Where another policy gets more, by more than its error, `optimal` is not the optimum.
+    error = _ERROR * abs(of["optimal"])
+    more = [total - totals["optimal"] for total in totals.values()]
+    is_exceeded = any(x.mean() > error + 2 * np.std(x) / np.sqrt(num_starts) for x in more)
+    optimal = of["optimal"] if has_optimum and not is_exceeded else None
     return {
         "return": of["latent"],
         "optimal": optimal,
@@ -113,23 +101,8 @@ def _returns(
     }
 
 
-def _is_exceeded(rewards: Mapping[str, tuple[np.ndarray, np.ndarray]], num_starts: int) -> bool:
-    """Whether some policy gets more than `optimal` from random starts, by more than its error."""
-    of = {name: total[-num_starts:] for name, (total, _) in rewards.items()}
-    error = _ERROR * abs(of["optimal"].mean())
-    return any(
-        np.mean(more) > error + 2 * np.std(more) / np.sqrt(num_starts)
-        for more in (each - of["optimal"] for each in of.values())
-    )
-
-
 def missions(mission: Mission, played: Mapping[str, Measured]) -> Missions:
-    """The block `mission`.
-
-    Args:
-      mission: all robots and their arena.
-      played: metrics of the missions of each case, in the same arenas.
-    """
+    """The block `mission`, from metrics of the missions of each case, in the same arenas."""
     found: Missions = {name: case(mission.config, name, each) for name, each in played.items()}
     for name, block in cases(found).items():
         if REFERENCE in played and name != REFERENCE:
@@ -139,12 +112,7 @@ def missions(mission: Mission, played: Mapping[str, Measured]) -> Missions:
 
 
 def case(config: Config, name: str, found: Measured) -> Case:
-    """One case of the block `mission`.
-
-    Args:
-      config: all settings.
-      name: of the case.
-      found: metrics of its missions.
+    """One case of the block `mission`, from metrics of its missions.
 
     Returns:
       Means over the missions, except the median of `time_s` and the sum of `collisions`.
@@ -157,7 +125,7 @@ def case(config: Config, name: str, found: Measured) -> Case:
         "collisions": int(found["collisions"].sum()),
         "goals_reached_fraction": _share(found["goals_reached"].sum(), found["goals"].sum()),
         "information": float(found["information"].mean()),
-        "calibration": calibration(found),
+        "calibration": _calibration(found),
         "episodes": len(found["time_s"]),
         "ended": {
             reason: int(np.sum(found["reason"] == code))
@@ -176,23 +144,16 @@ def case(config: Config, name: str, found: Measured) -> Case:
     return block
 
 
-def calibration(found: Measured) -> Calibration:
-    """Whether the confidence of maps matches their accuracy, at PoIs that were detected.
-
-    Args:
-      found: metrics of missions.
-    """
+def _calibration(found: Measured) -> blocks.Calibration:
+    """Whether the confidence of maps matches their accuracy, at PoIs that were detected."""
     is_seen = np.asarray(found["seen"])
 
     def of_seen(name: str) -> float | None:
         values = np.asarray(found[name], float)[is_seen]
         return float(values.mean()) if values.size else None
 
-    return {
-        "confidence": of_seen("confidence"),
-        "accuracy": of_seen("is_right"),
-        "nll": of_seen("nll"),
-    }
+    names = {"confidence": "confidence", "accuracy": "is_right", "nll": "nll"}
+    return blocks.Calibration(**{key: of_seen(name) for key, name in names.items()})
 
 
 def _share(part: int, whole: int) -> float | None:
@@ -200,22 +161,17 @@ def _share(part: int, whole: int) -> float | None:
     return float(part / whole) if whole else None
 
 
-def traffic(mission: Mission, detections: np.ndarray) -> Traffic:
-    """Network traffic of a detection.
+def traffic(mission: Mission, detections: np.ndarray) -> blocks.Traffic:
+    """Bytes of a belief, and of the features and the scan of a mean detection.
 
     Args:
       mission: all robots and their sensors.
-      detections: `[R]` number of each robot's detections.
-
-    Returns:
-      Sizes in bytes: of a belief, and the means of the detections' features and scans; without
-      detections the means over the robots.
+      detections: `[R]` number of each robot's detections; without any, robots count alike.
     """
     detections = np.maximum(detections, 0 if np.any(detections) else 1)
     config = mission.config
-    sensors = [mission.world.sensors[m] for m in config.modality_of_robot]
-    scans = np.array([sensor.scan_bytes for sensor in sensors])
-    features = np.array([_FLOAT_BYTES * len(config.labels(name)) for name in config.carried])
+    scans = [mission.world.sensors[m].scan_bytes for m in config.modality_of_robot]
+    features = [_FLOAT_BYTES * len(config.labels(name)) for name in config.carried]
     return {
         "latent": float(2 * _FLOAT_BYTES * config.jmvae.latent_size),
         "features": float(np.average(features, weights=detections)),

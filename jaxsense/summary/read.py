@@ -12,59 +12,12 @@ from jaxsense.config import ConfigError, parse_json
 from jaxsense.config.options import command
 from jaxsense.core import inside
 from jaxsense.summary import blocks
-from jaxsense.summary.blocks import Evaluation, Made, Missions, Results, Summary, Timed
-from jaxsense.summary.metrics import Interval
+from jaxsense.summary.blocks import Evaluation, Interval, Made, Missions, Results, Summary, Timed
 
 ORIGINS = "origins.json"
 EVALUATIONS = "evaluations"
 """The directory of evaluations in that of a run."""
-RESULTS = tuple(get_type_hints(Results))
 _MOST_CASES, _LARGEST = 1000, 1e30
-
-
-def read(run: Path) -> Summary:
-    """Reads the summary of a finished run, of one seed or of several.
-
-    Args:
-      run: its directory.
-
-    Raises:
-      ConfigError: if there is no summary, or a value in it is missing or wrong.
-    """
-    return cast(Summary, _read(run, run / "summary.json", Summary))
-
-
-def read_evaluations(run: Path) -> dict[str, Evaluation]:
-    """Reads the evaluations of a run.
-
-    Args:
-      run: its directory.
-
-    Returns:
-      The evaluations, by the names of their files.
-
-    Raises:
-      ConfigError: if one cannot be read, or a value in it is missing or wrong.
-      OSError: see `inside.matching`.
-    """
-    files = inside.matching(run, f"{EVALUATIONS}/*.json")
-    return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
-
-
-def read_made(run: Path) -> list[Made]:
-    """Reads what made each stage of a run, which need not be finished.
-
-    Args:
-      run: its directory.
-
-    Returns:
-      The content of its `origins.json`; of none, nothing.
-
-    Raises:
-      ConfigError: if the file cannot be read, or a value in it is missing or wrong.
-    """
-    file = run / ORIGINS
-    return cast(list[Made], _read(run, file, list[Made])) if file.exists() else []
 
 
 class NotFinishedError(ConfigError):
@@ -76,9 +29,39 @@ class NotFinishedError(ConfigError):
         ValueError.__init__(self, f"{run} {self.expected}")
 
 
-def _read(run: Path, file: Path, kind: type) -> object:
-    if kind is Summary and not os.path.lexists(file):
+def read(run: Path) -> Summary:
+    """The summary of a finished run, of one seed or of several.
+
+    Raises:
+      ConfigError: if there is no summary, or a value in it is missing or wrong.
+    """
+    if not os.path.lexists(run / "summary.json"):
         raise NotFinishedError(run)
+    return cast(Summary, _read(run, run / "summary.json", Summary))
+
+
+def read_evaluations(run: Path) -> dict[str, Evaluation]:
+    """The evaluations of a run, by the names of their files.
+
+    Raises:
+      ConfigError: if one cannot be read, or a value in it is missing or wrong.
+      OSError: see `inside.matching`.
+    """
+    files = inside.matching(run, f"{EVALUATIONS}/*.json")
+    return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
+
+
+def read_made(run: Path) -> list[Made]:
+    """What made each stage of a run, which need not be finished; without `origins.json`, nothing.
+
+    Raises:
+      ConfigError: if the file cannot be read, or a value in it is missing or wrong.
+    """
+    file = run / ORIGINS
+    return cast(list[Made], _read(run, file, list[Made])) if file.exists() else []
+
+
+def _read(run: Path, file: Path, kind: type) -> object:
     try:
         content = parse_json(inside.read(file))
         json.dumps(content, allow_nan=False)

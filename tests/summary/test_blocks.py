@@ -5,7 +5,7 @@ import json
 import pytest
 from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
 
-from jaxsense.summary import BLOCKS, metrics
+from jaxsense.summary import BLOCKS, blocks
 
 KEYS = {place + key for place, block in BLOCKS.items() for key in block}
 # Only in some runs: of several seeds, of a team, from scans, or of one robot alone.
@@ -62,4 +62,4 @@ def test_every_rare_key_is_somewhere():
     ],
 )
 def test_numbers_as_text(value, digits, expected):
-    assert metrics.text(value, digits) == expected
+    assert blocks.text(value, digits) == expected

@@ -15,16 +15,6 @@ def test_the_interval_is_that_of_student():
     np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
 
 
-def test_a_single_value_has_no_interval():
-    assert compare.interval(np.array([3.0])) == {"mean": 3.0, "low": None, "high": None}
-
-
-def test_what_was_never_seen_is_rare_with_confidence():
-    # If .05 = (1 - share)^n: of one trial .95, of 384 some 3 / n.
-    assert compare.at_most(1) == pytest.approx(0.95)
-    assert compare.at_most(384) == pytest.approx(0.00777, abs=1e-5)
-
-
 def test_differences_are_taken_arena_by_arena():
     # Of two PoIs: half, both and both right, against none, half and half.
     found = {
@@ -111,27 +101,41 @@ def test_less_than_half_a_percent_is_as_fast(seconds, told):
     assert found == f"By median times, the latent policy is {told} naive exploration."
 
 
-def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
-    latent = block(0.90, 1.5, 36.0)
-    # 36 / 40 = .9 and 36 / 30 = 1.2; `random` is faster, but wrong, and nobody alone counts.
-    others = {"auction": block(0.90, 2.0, 30.0), "nearest": block(0.98, 2.0, 33.0)}
+FASTER = "By median times, the latent policy is 10 % faster than naive exploration"
+LESS = "It labels 80.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."
+MORE = "It labels 97.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "others", "told"),
+    [
+        # 36 / 40 = .9 and 36 / 30 = 1.2; `random` is faster, but wrong, and nobody alone counts.
+        (0.9, {}, f"{FASTER}."),
+        (
+            0.9,
+            {"auction": block(0.9, 2.0, 30.0), "nearest": block(0.98, 2.0, 33.0)},
+            f"{FASTER} (and 20 % slower than auction).",
+        ),
+        (0.9, {"naive_3": block(0.99, 6.0, 20.0)}, f"{FASTER}."),
+        (0.8, {}, f"{FASTER}. {LESS}"),
+        (
+            0.97,
+            {"auction": block(0.97, 2.0, 30.0)},
+            f"{FASTER} (and 20 % slower than auction). {MORE}",
+        ),
+    ],
+)
+def test_the_verdict_names_naive_exploration_and_the_fastest_policy(accuracy, others, told):
     wrong = {"random": block(0.5, 1.0, 9.0), "camera_alone": block(0.99, 1.0, 8.0)}
-    faster = "By median times, the latent policy is 10 % faster than naive exploration"
-    assert compare.verdict({**NAIVE, "latent": latent, **wrong}) == f"{faster}."
-    found = compare.verdict({**NAIVE, "latent": latent, **others, **wrong})
-    assert found == f"{faster} (and 20 % slower than auction)."
+    latent = block(accuracy, 1.5, 36.0)
+    assert compare.verdict({**NAIVE, "latent": latent, **wrong, **others}) == told
+
+
+def test_the_verdict_of_several_seeds_is_that_of_their_means():
     assert compare.verdict(NAIVE) is None
-    quick = {**NAIVE, "naive_3": block(0.99, 6.0, 20.0), "latent": latent}
-    assert compare.verdict(quick) == f"{faster}."
-    worse = {**NAIVE, "latent": block(0.8, 1.5, 36.0)}
-    told = "It labels 80.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."
-    assert compare.verdict(worse) == f"{faster}. {told}"
-    better = {**NAIVE, "latent": block(0.97, 1.5, 36.0), "auction": block(0.97, 2.0, 30.0)}
-    told = "It labels 97.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."
-    assert compare.verdict(better) == f"{faster} (and 20 % slower than auction). {told}"
     seeds = {"mean": 50.0, "low": 40.0, "high": 60.0}
-    slow = {**latent, "time_s": seeds}
-    assert "25 % slower than naive" in compare.verdict({**NAIVE, "latent": slow})
+    latent = {**block(0.90, 1.5, 36.0), "time_s": seeds}
+    assert "25 % slower than naive" in compare.verdict({**NAIVE, "latent": latent})
 
 
 @pytest.mark.parametrize(
@@ -142,18 +146,14 @@ def test_the_verdict_names_naive_exploration_and_the_fastest_policy():
         ([0.5, 0.14], "NLL after 2 looks is 0.14, that of exact Bayes 0.10."),
         ([0.9, 0.14], "NLL after 1 look is 0.90, that of exact Bayes 0.50."),
         ([0.5, math.nan], "NLL after 2 looks is nan"),
+        # .7 - .5 = .2 after one look, and .5 - .1 = .4 after two, where the NLL itself is lower.
+        ([0.7, 0.5], "NLL after 2 looks is 0.50, that of exact Bayes 0.10."),
     ],
 )
 def test_a_map_that_loses_information_is_told(nll, expected):
     block = {"looks": [1, 2], "nll": nll, "bayes_nll": [0.5, 0.1]}
     told = compare.unsound(block)
     assert told is None if expected is None else expected in told
-
-
-def test_the_largest_loss_of_information_is_told():
-    # .7 - .5 = .2 after one look, and .5 - .1 = .4 after two, where the NLL itself is lower.
-    told = compare.unsound({"looks": [1, 2], "nll": [0.7, 0.5], "bayes_nll": [0.5, 0.1]})
-    assert "NLL after 2 looks is 0.50, that of exact Bayes 0.10." in told
 
 
 def test_no_remark_advises_where_results_are_not_meant_to_be_good():
@@ -165,3 +165,26 @@ def test_no_remark_advises_where_results_are_not_meant_to_be_good():
     assert "Try" not in of_smoke
     sound = {"preset": "default", "belief": {**worse, "nll": [0.5]}}
     assert compare.remarks(sound) == []
+
+
+def test_statistics_are_those_of_student():
+    # The mean of 1 and 3 is 2, its standard error 1, and t(.975, 1 degree of freedom) 12.706.
+    found = compare.statistics(
+        [{"a": {"b": 1}, "c": [5.0, None], "d": "x"}, {"a": {"b": 3}, "c": [5.0, 1.0], "d": "y"}]
+    )
+    assert found["a"]["b"] == pytest.approx({"mean": 2.0, "low": -10.706, "high": 14.706}, abs=1e-3)
+    assert found["c"] == [{"mean": 5.0, "low": 5.0, "high": 5.0}, None]
+    assert "d" not in found
+    some = compare.statistics([{"a": None, "b": 1.0}, {"a": 2.0, "b": None}, {"a": 2.0}])
+    assert some == {"a": None}
+    assert compare.statistics([{"a": 3.0}]) == {"a": {"mean": 3.0, "low": None, "high": None}}
+
+
+def test_the_times_of_seeds_add_up():
+    half = {"total_s": 5.0, "stages": {"jmvae": {"compile_s": 2.0, "run_s": 3.0}}}
+    blocks = {key: {"x": 1.0} for key in ("detectors", "jmvae", "belief", "dqn", "mission")}
+    runs = [{"seed": seed, "timing": half, **blocks} for seed in (4, 5)]
+    total, of_each, means = compare.of_seeds(runs)
+    assert total == {"total_s": 10.0, "stages": {"jmvae": {"compile_s": 4.0, "run_s": 6.0}}}
+    assert of_each == {"4": blocks, "5": blocks}
+    assert means["mission"] == {"x": {"mean": 1.0, "low": 1.0, "high": 1.0}}
