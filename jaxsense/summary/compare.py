@@ -175,7 +175,9 @@ def remarks(found: Summary) -> list[str]:
     """Sentences to keep in mind about all results of a run."""
     caution = unsound(found["belief"])
     if found["preset"] == "smoke":  # nobody wants to improve it
-        caution = "Preset smoke only checks that everything runs: its policies are not good."
+        caution = (
+            "Preset smoke only checks that everything runs: its policies are not meant to be good."
+        )
     return [each for each in (several_origins(found.get("origins", ())), caution) if each]
 
 
