@@ -20,7 +20,6 @@ _SPEED = 2.0  # times real time
 _AFTER = 10  # frames shown after the mission's end
 _PAUSE = 2.5  # s that the last one stays
 _TIMES = 3  # that it plays
-_TINY = 1e-3  # s, less than a control period
 _TOP, _LINE = 38, 26
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
 _NOTES = (
@@ -77,7 +76,7 @@ def draw(
     add(root, "rect", class_="film-paper", width=WIDTH, height=height)
     left, right = _half(root, 0, title), _half(root, 1, "the shared map")
     clock = [f"{t:.0f} s" for t in np.floor(record.time)]
-    is_over = record.time >= seconds - _TINY
+    is_over = record.time >= seconds - 1e-3
     clock = np.where(is_over, f"{seconds:.1f} s", clock).tolist()
     timeline.strip(left, clock, x=SIZE, y=25, class_="film-title film-end")
     draw_arena(_view(left), scene)

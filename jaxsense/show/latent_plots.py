@@ -35,7 +35,6 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
       posteriors: for `joint` and for each modality `[C, S, D]` beliefs.
     """
     names, classes = ["joint", *config.modalities], config.arena.classes
-    titles = {"joint": " & ".join(config.modalities)}
     rows = _ROW * len(classes) + 0.2
     figure = Figure(figsize=(3.6 * len(names) + 1.2, 4.6 + rows), layout="compressed")
     above, below = figure.subplots(
@@ -46,7 +45,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     dimensions = plane(np.mean(posteriors["joint"].mean, axis=1))
     flat = {n: jax.tree.map(lambda x: in_plane(x, dimensions), b) for n, b in shown.items()}
     for top, bottom, name in zip(above, below, names, strict=True):
-        top.set_title(titles.get(name, f"{name} alone"))
+        top.set_title(" & ".join(config.modalities) if name == "joint" else f"{name} alone")
         _draw_beliefs(top, flat[name], classes, colours)
         _draw_norms(bottom, np.linalg.norm(shown[name].std, axis=-1), colours)
         top.set_xlabel(f"latent dimension {dimensions[0] + 1}")

@@ -63,7 +63,9 @@ class Timeline:
             "transform" if is_transform else attribute,
             f"{attribute}({last})" if is_transform else last,
         )
-        kept = _changes(rows) if jumps else _corners(self.moments, rows, _CLOSE[attribute])
+        is_new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+        close = _CLOSE[attribute]
+        kept = np.flatnonzero(is_new) if jumps else _corners(self.moments, rows, close)
         if (rows[kept] == rows[-1]).all():
             return
         ends = [] if jumps else [(1.0, rows[-1])]  # the last frame stays
@@ -102,12 +104,6 @@ def _rule(attribute: str, row: np.ndarray) -> str:
     if attribute in _TRANSFORMS:
         return f"{{transform:{attribute}({value})}}"
     return f"{{{attribute}:{value}}}"
-
-
-def _changes(rows: np.ndarray) -> list[int]:
-    """Frames in which the `[F, K]` values change, the first included."""
-    is_new = (rows[1:] != rows[:-1]).any(axis=1)
-    return [0, *(1 + np.flatnonzero(is_new)).tolist()]
 
 
 def _corners(moments: np.ndarray, rows: np.ndarray, close: float) -> list[int]:

@@ -64,8 +64,7 @@ def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np
     axes[1].invert_yaxis()
     for each in state.teams:
         team = jax.tree.map(np.asarray, each.team)
-        classes_there = colours[np.asarray(each.map.classes)]
-        _draw_places(axes[2], team, int(each.agent), nearest, classes_there)
+        _draw_places(axes[2], team, int(each.agent), nearest, colours[truth])
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 

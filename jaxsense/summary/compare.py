@@ -24,9 +24,9 @@ UNKNOWN: Origin = {"versions": {}, "devices": []}
 """Origin of figures that do not tell it."""
 
 _MADE_BY = ("devices", "cores", "source", "commit")
-_CONFIDENCE = 0.95
 _NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
+_SMOKE = "Preset smoke only checks that everything runs: its policies are not meant to be good."
 _AS_FAST = 0.005  # share of a time that does not matter
 
 
@@ -37,7 +37,7 @@ def bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.full_like(average, np.nan), np.full_like(average, np.nan)
     error = values.std(axis=0, ddof=1) / np.sqrt(len(values))
     # `scipy.stats`, which calls the same function, takes a third of a second to import.
-    error = error * scipy.special.stdtrit(len(values) - 1, (1 + _CONFIDENCE) / 2)
+    error = error * scipy.special.stdtrit(len(values) - 1, 0.975)
     return average - error, average + error
 
 
@@ -175,9 +175,7 @@ def remarks(found: Summary) -> list[str]:
     """Sentences to keep in mind about all results of a run."""
     caution = unsound(found["belief"])
     if found["preset"] == "smoke":  # nobody wants to improve it
-        caution = (
-            "Preset smoke only checks that everything runs: its policies are not meant to be good."
-        )
+        caution = _SMOKE
     return [each for each in (several_origins(found.get("origins", ())), caution) if each]
 
 
