@@ -8,7 +8,6 @@ import re
 import shlex
 import shutil
 import subprocess
-from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import jax
@@ -40,69 +39,17 @@ def run(tmp_path_factory):
     return path
 
 
-class Reader(HTMLParser):
-    """Collects the tags of a page with their attributes, and the rows of its tables."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.rows, self.words, self.in_cell = [], [], [], False
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append((tag, dict(attrs)))
-        if tag == "tr":
-            self.rows.append([])
-        if tag in ("td", "th") and self.rows:
-            self.rows[-1].append("")
-            self.in_cell = True
-
-    def handle_endtag(self, tag):
-        self.in_cell = self.in_cell and tag not in ("td", "th")
-
-    def handle_data(self, data):
-        self.words.append(data)
-        if self.in_cell:
-            self.rows[-1][-1] += data.strip().replace("\u00a0", " ")
+def words(text):
+    """What a page says."""
+    return " ".join(html.unescape(re.sub("<[^<>]*>", " ", text)).split())
 
 
-@pytest.fixture(scope="module")
-def read(run):
-    return Reader((run / "report.html").read_text())
-
-
-def test_the_page_asks_for_nothing(run, read):
-    addresses = [
-        value
-        for _, attributes in read.tags
-        for name, value in attributes.items()
-        if name in ("src", "href", "srcset", "action", "data", "poster") or name.endswith(":href")
-    ]
+def test_the_page_asks_for_nothing(run):
+    text = (run / "report.html").read_text()
+    addresses = re.findall(r'(?:src|href|srcset|action|data|poster)="([^"]*)"', text)
     assert len(addresses) > 3
     assert all(address.startswith(("data:", "#")) for address in addresses)
-    text = (run / "report.html").read_text()
     assert not re.search(r"@import|url\((?!#)|<script|\son\w+=", text)
-
-
-def rows_of(text):
-    return {row[0]: row[1:] for row in Reader(text).rows if row}
-
-
-def test_figures_stand_in_tables(read):
-    columns, *rows = [row for row in read.rows if len(row) > 1]
-    assert columns == ["", "right", "looks per PoI", "median time [s]", "collisions", "unfinished"]
-    assert rows[0] == ["latent", "0.998", "1.68", "13.8", "0", "1 time limit"]
-    rows = [tuple(row) for row in rows]
-    assert ("camera", "0.9995", "0.0100", "0.0200") in rows
-    agent = ("1.234", "1.250", "1.240", "1.000", "-1.500", "0.988", "1,700", "1,728")
-    assert ("lidar", *agent) in rows
-    assert ("here", "2", "0.007", "0.0001", "0.9996", "0.021", "0.030", "0.938") in rows
-    # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder. In brackets the looks
-    # after which just the right classes are plausible, and the norm of sigma.
-    red = ["no / no (100.0%, 1.25)", "yes / no (100.0%, 1.25)", "yes / yes (100.0%, 1.25)"]
-    assert ("red cylinder", *red) in rows
-    assert ("one step: optimal", "0.870", "0.870", "0.426*") in rows
-    assert ("permutations", "384", "384", "384") in rows
-    assert ("jmvae", "1.50", "4.50") in rows
 
 
 def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
@@ -150,16 +97,16 @@ def test_the_program_of_the_page_runs(run, monkeypatch, capsys):
     assert capsys.readouterr().out == f"{played.records.belief.mean[-1]} {played.end.classes}\n"
 
 
-def test_what_was_run_is_told_and_escaped(run, read):
-    text = " ".join(" ".join(read.words).split())
-    for words in ("smoke preset, seed 90210", "0123abc", "jax <0.10>", "unchanged from the preset"):
-        assert words in text
+def test_what_was_run_is_told_and_escaped(run):
+    page = (run / "report.html").read_text()
+    text = words(page)
+    for told in ("smoke preset, seed 90210", "0123abc", "jax <0.10>", "unchanged from the preset"):
+        assert told in text
     assert f"evaluate {shlex.quote(str(run))} --episodes" in text
-    assert ("html", {"lang": "en"}) in read.tags
-    images = [attributes for tag, attributes in read.tags if tag == "img"]
-    assert len(images) == 2
-    assert all(len(image["alt"]) > 20 for image in images)
     assert "Animation mission: robots in the arena" in text
+    alternatives = re.findall('<img [^>]*alt="([^"]*)"', page)
+    assert len(alternatives) == 2
+    assert all(len(alternative) > 20 for alternative in alternatives)
 
 
 def test_changed_settings_are_named(tmp_path):
@@ -286,13 +233,10 @@ def test_a_browser_shows_all_of_it(run, tmp_path, width):
 
 def test_evaluations_have_tables_of_their_own(tmp_path):
     text = page.render(tmp_path, CONFIG, SUMMARY, {"there": EVALUATION})
-    words = " ".join(Reader(text).words)
-    assert "Evaluation: 16 PoIs in 6 m; robots: 2 camera, 1 lidar; seed 7" in words
-    # A seed is no count, and stands above the table of all metrics.
-    assert '<th scope="col">seed</th>' not in text
-    rows = [row for row in Reader(text).rows if row and row[0] == "latent"]
+    assert "Evaluation: 16 PoIs in 6 m; robots: 2 camera, 1 lidar; seed 7" in words(text)
+    rows = re.findall(r'<th scope="row">latent</th>\s*<td>(?:<b>)?([\d.]+)', text)
     # Of each: the main figures, all of them, and the calibration of the maps.
-    assert [row[1] for row in rows] == ["0.998", "0.998", "0.998", "0.750", "0.750", "0.998"]
+    assert rows == ["0.998", "0.998", "0.998", "0.750", "0.750", "0.998"]
 
 
 def test_a_page_of_several_seeds_links_to_theirs(tmp_path):

@@ -55,18 +55,3 @@ def test_pages_can_be_read_on_github(path):
     text = path.read_text(encoding="utf-8")
     assert not [*dead_links(path, text)]
     assert set(re.findall(r"^[`:]{3,}\{([\w-]+)\}", text, re.M)) <= HARMLESS
-
-
-def test_the_front_page_leads_to_every_page():
-    """By links in its text or in the pages that it links; GitHub hides tables of contents."""
-    front = ROOT / "docs" / "index.md"
-    found, left = {front}, [front]
-    while left:
-        path = left.pop()
-        text = without_code(path.read_text(encoding="utf-8"))
-        targets = re.findall(r"\]\(([^()\s#:]+)[^()\s]*\)", text)
-        new = {file for x in targets if (file := linked(path, x)).parent == front.parent} - found
-        left += [file for file in new if file.suffix == ".md"]
-        found |= new
-    pages = {*(ROOT / "docs").glob("*.md"), *(ROOT / "docs").glob("*.rst")}
-    assert not pages - found

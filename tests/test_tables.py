@@ -62,3 +62,20 @@ def test_every_metric_of_missions_is_shown_for_who_has_it():
     expected = {m.label for key, m in MISSIONS.items() if not key.startswith(absent)}
     assert {*first.columns, *calibration.columns} == expected
     assert [texts[first.columns.index("right labels")] for _, texts in first.rows] == ["-", "0.750"]
+
+
+def test_figures_stand_in_tables():
+    rows = dict(tables.detectors(SUMMARY).rows)
+    assert rows["camera"] == ["0.9995", "0.0100", "0.0200"]
+    of_agent = ["1.234", "1.250", "1.240", "1.000", "-1.500", "0.988", "1,700", "1,728"]
+    assert dict(tables.agents(SUMMARY).rows)["lidar"] == of_agent
+    here = ["2", "0.007", "0.0001", "0.9996", "0.021", "0.030", "0.938"]
+    assert tables.latent_space(SUMMARY).rows == [("here", here)]
+    # Camera, LiDAR and both; the paper's LiDAR cannot tell a red cylinder. In brackets the looks
+    # after which just the right classes are plausible, and the norm of sigma.
+    red = ["no / no (100.0%, 1.25)", "yes / no (100.0%, 1.25)", "yes / yes (100.0%, 1.25)"]
+    classes = "green cylinder", "red cylinder", "red cube"
+    assert dict(tables.unambiguous(SUMMARY, classes).rows)["red cylinder"] == red
+    paper = dict(tables.paper(SUMMARY).rows)
+    assert paper["one step: optimal"] == ["0.870", "0.870", "0.426*"]
+    assert tables.times(SUMMARY, SUMMARY["timing"])[0].rows == [("jmvae", ["1.50", "4.50"])]
