@@ -85,14 +85,12 @@ class Dqn:
         settings = DqnConfig(
             num_envs=self.num_envs,
             epochs=epochs,
-            chunk=epochs,
             updates=self.updates,
             batch=self.batch,
             replay_capacity=self.replay,
             learning_rate=self.learning_rate,
             epsilon_decay=0.01 ** (1 / (self.exploration * epochs)),
             target_period=self.target_period,
-            num_starts=NUM_STARTS,
         )
 
         def train(key: Key, task: tasks.Task) -> Params:
@@ -174,11 +172,11 @@ def dqn_seeds(options: Options) -> Row:
 
 def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     """512 environments, one gradient step of batch 512 for each step of all of them."""
-    settings = DqnConfig(observe="bank", num_envs=512, epochs=epochs, chunk=100, updates=1)
+    settings = DqnConfig(observe="bank", num_envs=512, epochs=epochs, updates=1)
     settings = dataclasses.replace(settings, batch=512, replay_capacity=131072)
     if options.quick:
-        few = {"num_envs": 16, "batch": 16, "num_starts": 16, "replay_capacity": 1024}
-        settings = dataclasses.replace(settings, **few, epochs=4, chunk=2)
+        few = {"num_envs": 16, "batch": 16, "replay_capacity": 1024}
+        settings = dataclasses.replace(settings, **few, epochs=4)
     return settings
 
 

@@ -17,6 +17,7 @@ from benchmarks.measure import Options, Row, Side
 from benchmarks.missions import PERIODS_BEFORE, untrained
 from benchmarks.peers import native
 from jaxsense import Config, init, mission
+from jaxsense.config import CONTROL_PERIOD
 from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.motion import move
 from jaxsense.mission.rollout import step as mission_step
@@ -252,8 +253,7 @@ def _played(batch: int, periods: int) -> tuple[Mission, MissionState]:
 
 def _as_drives(states: MissionState) -> Drives:
     """`[B * P]` drives, each of one control period, with the commands that `move` gives."""
-    config = _UNTRAINED.mission
-    substeps = round(config.control_period / arenas.TIMESTEP)
+    substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
     flat: MissionState = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
 
     def ramp(command: jax.Array, wanted: jax.Array) -> jax.Array:
@@ -311,7 +311,7 @@ def _move_side(scenario: Mission, states: MissionState) -> Side:
         return tuple(jnp.swapaxes(x, 0, 1) for x in (poses, velocity))  # pyright: ignore
 
     batch, number = states.steps.shape
-    substeps = round(scenario.config.mission.control_period / arenas.TIMESTEP)
+    substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
     work = batch * number * substeps
     workers = devices.start(None)
     return measure.compiled(periods, states, work=work, batch=batch, workers=workers)

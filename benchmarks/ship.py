@@ -41,7 +41,7 @@ def _map(config: Config) -> Config:
 
 def _team(config: Config) -> Config:
     """A team at the start of its work, which pays about a third of what it earns for its time."""
-    team = dataclasses.replace(config.team, second_cost=0.05, partly_seen=0.0)
+    team = dataclasses.replace(config.team, second_cost=0.05)
     return dataclasses.replace(config, team=team)
 
 

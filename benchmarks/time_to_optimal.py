@@ -33,7 +33,6 @@ _CONFIG = dataclasses.replace(
     dqn=DqnConfig(
         observe="bank",
         epochs=400,
-        chunk=20,
         updates=8,
         batch=256,
         replay_capacity=65536,

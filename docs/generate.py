@@ -295,7 +295,7 @@ SETTINGS = """# Settings
 
 Each setting is an option of `python -m jaxsense.train`, with `-` in place of `_`:
 
-    python -m jaxsense.train --arena.num-pois 4 --mission.no-redecides
+    python -m jaxsense.train --arena.num-pois 4 --mission.no-auctions
 
 The name alone turns a setting on; `no-` before its last part turns it off. In Python, settings
 are frozen dataclasses: `dataclasses.replace(config, arena=dataclasses.replace(config.arena,

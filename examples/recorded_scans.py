@@ -26,6 +26,7 @@ import numpy as np
 
 import jaxsense
 from jaxsense import recorded, sim
+from jaxsense.config import Search
 from jaxsense.recorded import RecordedLooks
 
 
@@ -42,7 +43,7 @@ def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks)
             # What the look says of the PoI, which may be that there is nothing.
             bearing, distance = (jnp.float32(values[n]) for values in views[sensor.name])
             scan = looks.scans[sensor.name][n]
-            search = config.mission.localisation.search
+            search = Search(*config.mission.localisation.search)
             detection = models.detect(m, sensor, scan, bearing, distance, search)
             if not detection.is_known:
                 where = f"{distance:.2f} m away at {np.degrees(bearing):.0f} degrees"

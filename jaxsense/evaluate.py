@@ -13,7 +13,7 @@ import rich.console
 import rich.table
 
 from jaxsense import mission, summary
-from jaxsense.config import TIMESTEP, Config, ConfigError
+from jaxsense.config import CONTROL_PERIOD, TIMESTEP, Config, ConfigError
 from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     say(
         f"{number} missions in {seconds:.1f} s after {compiled - begin:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "
-        f"{rate * config.mission.control_period / TIMESTEP:.0f} physics steps/s"
+        f"{rate * CONTROL_PERIOD / TIMESTEP:.0f} physics steps/s"
     )
     for line in written:
         say(line)

@@ -21,16 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import MAX_BEARING, POI_HEIGHT, Config, ConfigError, Search
 from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn.travel import Travel
 from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps, memory
 from jaxsense.mission.choice import ask, choose, times_to_new_looks
-from jaxsense.mission.state import RECENT_LOOKS
+from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
 from jaxsense.models import Models, make_agent, make_jmvae
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
@@ -116,7 +117,7 @@ def _detect(config: Config, m: int) -> Function:
         models: Models, readings: jax.Array, bearing: jax.Array, distance: jax.Array
     ) -> Arrays:
         """What a look says."""
-        search = mission.localisation.search
+        search = Search(*mission.localisation.search)
         found = models.detect(m, sensor, readings, bearing, distance, search)
         is_confident = jnp.max(found.features) >= mission.least_confidence
         return {**vars(found), "detects": found.is_there & is_confident}
@@ -207,7 +208,9 @@ def _decide(config: Config) -> Function:
             looks=jnp.zeros((mean.shape[0], modalities), jnp.int32),
             log_posterior=jnp.zeros((mean.shape[0], classes)),
             team=team,
-            times=times_to_new_looks(config.team.travel, models.novelty, team, apart),
+            times=times_to_new_looks(
+                Travel(config.team.travel.view_distance), models.novelty, team, apart
+            ),
             robot=robot,
         )
         opinion = ask(key, POLICIES["latent"], models, known)
@@ -276,7 +279,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "num_pois": config.arena.num_pois,
         "pois": {
             "radius": float(config.arena.poi_radius),
-            "height": float(config.arena.poi_height),
+            "height": POI_HEIGHT,
             "about": "of the PoIs that the detectors know, in metres; half the side of boxes",
         },
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
@@ -288,11 +291,11 @@ def _description(config: Config, models: Models) -> dict[str, object]:
         "viewpoint": {
             "min_distance": float(viewpoint.min_distance),
             "max_distance": float(viewpoint.max_distance),
-            "max_bearing": round(math.radians(float(viewpoint.max_bearing)), 6),
+            "max_bearing": round(math.radians(MAX_BEARING), 6),
             "about": "from where the detectors have learned to look at a PoI: distances of its "
             "centre, in metres, and the largest bearing to either side, in radians",
         },
-        "mission": {"attempts": int(mission.attempts), "redecides": bool(mission.redecides)},
+        "mission": {"attempts": ATTEMPTS},
         "remembered_looks": memory.MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
         "versions": {"jaxsense": __version__},
     }

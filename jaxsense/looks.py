@@ -13,7 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import Config
+from jaxsense.config import PLANNING_RADIUS, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
@@ -101,7 +101,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
     settings = config.team
     places = Places(
         sides=settings.sides,
-        robot_radius=config.navigation.robot_radius,
+        robot_radius=PLANNING_RADIUS,
         poi_pitch=config.arena.poi_pitch,
         num_pois=settings.num_pois[1],
         cells_per_side=settings.cells_per_side,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import Config, SearchConfig
+from jaxsense.config import MAX_BEARING, Config, Search
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
@@ -30,7 +30,8 @@ from jaxsense.vae.leave_one_out import Encoder, Shape
 from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Readout
 
-_NO_SEARCH = SearchConfig()
+_NO_SEARCH = Search()
+_UNSEEN_VARIANCE = 20.0  # of each latent dimension of the belief before any look
 
 
 @pytree
@@ -69,7 +70,7 @@ class Models:
         readings: Float[Array | np.ndarray, "B ..."],
         bearing: Float[Array, ""],
         distance: Float[Array, ""],
-        search: SearchConfig = _NO_SEARCH,
+        search: Search = _NO_SEARCH,
     ) -> Detection:
         """What a look says, from a whole scan.
 
@@ -103,7 +104,7 @@ class Models:
         readings: Float[Array, "W ..."],
         bearing: Float[Array, ""],
         distance: Float[Array, ""],
-        search: SearchConfig = _NO_SEARCH,
+        search: Search = _NO_SEARCH,
     ) -> Detection:
         """What a look says, from the rays that the detector reads; otherwise as `detect`.
 
@@ -156,7 +157,7 @@ def make_frame(config: Config, sensor: Sensor) -> Frame:
     # Near the edge of the field of view, a window ends at the last ray, off the PoI's bearing.
     margin = (np.ptp(sensor.angles) - np.ptp(angles)) / 2
     viewpoint = config.viewpoint
-    off = jnp.maximum(0.0, jnp.radians(viewpoint.max_bearing) - margin)
+    off = jnp.maximum(0.0, jnp.radians(MAX_BEARING) - margin)
     return frames.make(
         angles,
         sensor.channels,
@@ -179,7 +180,7 @@ def make_shape(config: Config) -> Shape:
 
 def make_prior(config: Config) -> Belief:
     """Belief before any look, `[D]`."""
-    return fusion.prior(make_jmvae(config), config.mdp.unseen_variance)
+    return fusion.prior(make_jmvae(config), _UNSEEN_VARIANCE)
 
 
 @checks.typed
@@ -294,9 +295,7 @@ def init(key: Key, config: Config) -> Models:
         untrained = tuple(make_detector(k, config, m, windows[m]) for m, k in enumerate(keys))
     fusions: dict[str, Callable[[], Fusion]] = {
         "in_place": lambda: make_in_place(config, params, classes),
-        "filter": lambda: filter.init(
-            filter_key, model, classes, make_prior(config), config.filter
-        ),
+        "filter": lambda: filter.init(filter_key, model, classes, make_prior(config)),
     }
     return make_models(
         config,

@@ -18,15 +18,13 @@ MANY = replace(CONFIG, arena=replace(CONFIG.arena, num_pois=16, side=6.0))
 GIB = 2**30
 
 
-def crowded(config, num_pois=64, robots=32, distances=20, own_maps=True):
-    """Settings of missions with the most PoIs, robots and viewpoints, or with fewer."""
-    distances = tuple(0.6 + 0.01 * i for i in range(distances))
+def crowded(config, num_pois=64, robots=32, own_maps=True):
+    """Settings of missions with the most PoIs and robots, or with fewer."""
     own = replace(config.mission, communication=CommunicationConfig(own_maps=own_maps))
     return replace(
         config,
         arena=replace(config.arena, num_pois=num_pois, side=10.0),
         robots=robots * ("camera", "lidar"),
-        navigation=replace(config.navigation, view_distances=distances),
         jmvae=replace(config.jmvae, fusion="filter"),
         mission=own,
     )
@@ -60,8 +58,8 @@ def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
     "config",
     [
         pytest.param(MANY, id="PoIs"),
-        pytest.param(crowded(CONFIG, num_pois=16, distances=2, own_maps=False), id="robots"),
-        pytest.param(crowded(CONFIG, num_pois=8, distances=2), id="maps"),
+        pytest.param(crowded(CONFIG, num_pois=16, own_maps=False), id="robots"),
+        pytest.param(crowded(CONFIG, num_pois=8), id="maps"),
         pytest.param(LARGEST, id="largest", marks=pytest.mark.slow),
     ],
 )
@@ -86,7 +84,6 @@ def test_the_largest_missions_fit_into_the_memory(monkeypatch):
     [
         ({"num_pois": 65}, "arena.num_pois = 65: must be from 1 to 64"),
         ({"robots": 33}, r"robots = \('camera', .*: must have 1 to 64 values"),
-        ({"distances": 21}, r"navigation.view_distances = \(0.6, .*: must have 1 to 20 values.*"),
     ],
 )
 def test_missions_that_are_larger_are_refused(larger, expected):

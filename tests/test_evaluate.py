@@ -23,7 +23,7 @@ from smoke import MISSION_KEYS, error_line
 
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
-from jaxsense.config import PRESETS, ConfigError
+from jaxsense.config import CONTROL_PERIOD, PRESETS, ConfigError
 from jaxsense.run import batches, cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
@@ -327,7 +327,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         played = player.play(jax.random.key(0), models, {"latent": case}, 1)
     found, recording = played.metrics["latent"], played.recording
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
-    seconds = recording.end.steps * config.mission.control_period
+    seconds = recording.end.steps * CONTROL_PERIOD
     assert found["time_s"][0] == pytest.approx(seconds)
     drawn = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
     texts = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}

@@ -10,7 +10,7 @@ import pytest
 
 import jaxsense
 from jaxsense import looks, mission
-from jaxsense.config import PRESETS, FilterConfig, JmvaeConfig
+from jaxsense.config import PLANNING_RADIUS, PRESETS, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.dqn import map_mdp, rewards
@@ -141,9 +141,9 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     assert isinstance(mdp, TeamMdp)
     assert mdp.map.num_pois == config.team.num_pois[1]
     assert mdp.places.poi_pitch == config.arena.poi_pitch
-    assert mdp.places.robot_radius == config.navigation.robot_radius
+    assert mdp.places.robot_radius == PLANNING_RADIUS
     # Nothing else of them is an input of a compiled program.
-    assert jax.tree.leaves(mdp.places) == [*config.team.sides, config.navigation.robot_radius]
+    assert jax.tree.leaves(mdp.places) == [*config.team.sides, PLANNING_RADIUS]
     assert mdp.config is config.team
 
 
@@ -199,8 +199,8 @@ def test_entropy_by_hand():
 def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(models):
     # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
     classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-    prior, sizes = fusion.prior(MODEL, 20.0), FilterConfig(hidden=(1,))
-    found = jax.jit(lambda key: filter.init(key, MODEL, classes, prior, sizes))(jax.random.key(0))
+    prior = fusion.prior(MODEL, 20.0)
+    found = jax.jit(lambda key: filter.init(key, MODEL, classes, prior, (1,)))(jax.random.key(0))
     of_moments = np.linalg.pinv(found.readout.of_classes)
     kernel = jnp.float32(np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]) @ of_moments.T)
     layer = {"kernel": kernel, "bias": jnp.zeros(len(of_moments))}

@@ -25,10 +25,8 @@ NUMBERS = {
     "dqn.target-period": "7",
     "lidar.range-noise": "0.02",
     "camera.pixel-noise": "0.01",
-    "viewpoint.max-bearing": "15",
-    "navigation.inflation": "0.08",
+    "viewpoint.bearing-error": "2",
     "mission.equal-values": "0.2",
-    "mission.attempts": "2",
     "mission.time-limit": "2",
 }
 

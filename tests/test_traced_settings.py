@@ -21,8 +21,8 @@ CONFIG = Config(
     jmvae=JmvaeConfig(hidden=(4,), steps=4, batch=4, annealing=0.5),
     mdp=MdpConfig(max_steps=3),
     dqn=DqnConfig(
-        hidden=(4,), num_envs=8, epochs=6, chunk=6, updates=1, batch=8, replay_capacity=32,
-        target_period=2, num_starts=16,
+        hidden=(4,), num_envs=8, epochs=6, updates=1, batch=8, replay_capacity=32,
+        target_period=2,
     ),
 )  # fmt: skip
 # Two values of each. Large learning rates, so that a few steps show; a threshold among the gains.
@@ -34,12 +34,9 @@ VALUES = {
     "jmvae.annealing": (0.1, 1.0),
     "jmvae.learning_rate": (0.02, 0.08),
     "mdp.min_increase": (0.05, 0.65),
-    "mdp.unseen_variance": (20.0, 4.0),
     "mdp.max_steps": (3, 1),
     "dqn.discount": (0.5, 0.9),
     "dqn.learning_rate": (0.02, 0.1),
-    "dqn.final_learning_rate": (0.001, 0.015),
-    "dqn.epsilon_start": (0.9, 0.6),
     "dqn.epsilon_min": (0.02, 0.2),
     "dqn.epsilon_decay": (0.3, 0.6),
     "dqn.target_period": (2, 3),
@@ -99,8 +96,8 @@ def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
     learning = {
         name for name in names if name.partition(".")[0] in ("detector", "jmvae", "mdp", "dqn")
     }
-    # The first are several numbers, the second needs a filter, and the last scans.
-    others = {"jmvae.reconstruction_weights", "mdp.look_cost", "jmvae.alpha_start"}
+    # The first are several numbers, and the second needs a filter.
+    others = {"jmvae.reconstruction_weights", "mdp.look_cost"}
     assert set(VALUES) == learning - others
 
 
@@ -130,7 +127,7 @@ def test_the_cost_of_a_look_may_be_traced():
     with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
     model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
     classes = Belief(jax.random.normal(keys[0], (3, 2)), jnp.full((3, 2), 0.2))
-    begin = jax.jit(lambda key: filter.init(key, model, classes, prior(model, 20.0), CONFIG.filter))
+    begin = jax.jit(lambda key: filter.init(key, model, classes, prior(model, 20.0)))
     models = dataclasses.replace(init(keys[1], CONFIG), fusion=begin(keys[1]))
     bank = (jnp.full((3, 1, 2), 0.5),) * 2
 

@@ -287,7 +287,7 @@ def test_all_help_explains_every_field(capsys, monkeypatch):
     assert common.endswith(f"--help-all lists all {len(options)} options.\n")
     assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
     assert "  --arena.side NUMBER\n      Inner length and width of the arena, in metres." in text
-    assert "(default: on; --mission.no-redecides turns it off)" in " ".join(text.split())
+    assert "(default: on; --mission.no-auctions turns it off)" in " ".join(text.split())
     assert "`" not in text
     # Each option has a text.
     assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
@@ -295,8 +295,8 @@ def test_all_help_explains_every_field(capsys, monkeypatch):
 
 def test_every_kind_of_option_is_read(tmp_path):
     words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
-        --mission.no-redecides --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
-        --team.travel.speed .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
+        --mission.no-auctions --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
+        --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
         --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
     arguments = train.parse(words.split())
     config, smoke = arguments.config, PRESETS["smoke"]
@@ -306,9 +306,9 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
     assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
     assert config.mdp.partly_seen_starts is True
-    assert config.mission == dataclasses.replace(smoke.mission, redecides=False)
+    assert config.mission == dataclasses.replace(smoke.mission, auctions=False)
     assert config.team == dataclasses.replace(
-        smoke.team, travel=dataclasses.replace(smoke.team.travel, speed=0.3)
+        smoke.team, travel=dataclasses.replace(smoke.team.travel, view_distance=0.3)
     )
     assert config.robots == ("camera", "camera", "lidar")
     assert config.dqn == dataclasses.replace(smoke.dqn, hidden=(8,), observe="live")

@@ -41,7 +41,7 @@ class NumpyMdp:
         self._bank = [np.asarray(features) for features in bank]
         self._encoders = {name: _layers(p) for name, p in params["encoders"].items()}
         self._decoders = [_layers(params["decoders"][name]) for name in config.modalities]
-        self._unseen_std = np.sqrt(np.float32(config.mdp.unseen_variance))
+        self._unseen_std = np.sqrt(np.float32(20.0))
 
     @property
     def observation_size(self) -> int:

@@ -8,7 +8,12 @@ from jaxsense.config.section import Section, Traced
 
 PROFILE = 64
 """Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""
+LOOKS_TOGETHER = 4
+"""Looks by each sensor at a PoI in an example for a JMVAE that learns from scans."""
 _MAX_BLOCKS = 32
+_MOST_IN_CHUNK = 100  # epochs
+_STARTS_EACH = 16
+_POINTS_PER_LOOK = 64
 _MAX_WEIGHT = 1_000_000
 _MAX_UNITS = 65_536  # of a layer; XLA aborts where a product of sizes overflows
 
@@ -53,8 +58,6 @@ class JmvaeConfig(Section, place="jmvae"):
     """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to each subset's."""
-    alpha_start: Traced[float] = limited(0.0, at_least=0, at_most=1)
-    """Share of the training after which alpha takes effect, if the JMVAE learns from scans."""
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
     """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
@@ -72,8 +75,6 @@ class JmvaeConfig(Section, place="jmvae"):
     """Number of times to train, from different random parameters. The run keeps the result with the
     lowest loss among those whose beliefs reproduce class probabilities exactly, or among all if the
     JMVAE learns from scans."""
-    looks: int = limited(4, at_least=2, at_most=100)
-    """Number of looks by each sensor at a PoI, if the JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
     """Detections per class and modality in the training set."""
     steps: int = limited(3000, at_least=1)
@@ -98,29 +99,24 @@ class JmvaeConfig(Section, place="jmvae"):
     @property
     def num_together(self) -> int:
         """Looks by each sensor at a PoI in one training example."""
-        return self.looks if self.reads_scans else 1
+        return LOOKS_TOGETHER if self.reads_scans else 1
 
 
 class FilterConfig(Section, place="filter"):
     """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
 
-    hidden: tuple[int, ...] = limited((32,), at_least=1, at_most=_MAX_UNITS, min_items=1)
-    """Sizes of the hidden layers of each modality's network."""
-    looks: int = limited(6, at_least=1, at_most=100)
-    """Number of looks in each training sequence."""
     steps: int = limited(2000, at_least=1)
     """Gradient steps."""
-    batch: int = limited(256, at_least=1)
-    """Sequences per gradient step."""
-    learning_rate: Traced[float] = limited(5e-3, above=0, at_most=1)
-    """Initial learning rate of Adam; decays to zero along a cosine."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Initial learning rate of Adam; decays to zero along a cosine."""
+        return 5e-3
 
 
 class MdpConfig(Section, place="mdp"):
     """The map MDP, a Markov decision process whose states are maps of beliefs."""
 
-    unseen_variance: Traced[float] = limited(20.0, above=0, at_most=_MAX_WEIGHT)
-    """Variance of each latent dimension of the prior, the belief before any look."""
     reward: str = "paper"
     """Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
     `nats`: the information gained about the class, minus `look_cost`. `package.module:function`:
@@ -142,16 +138,10 @@ class MdpConfig(Section, place="mdp"):
 
 
 class TravelConfig(Section, place="team.travel"):
-    """The travel model: a robot turns to a PoI, drives straight until it is near, and looks."""
+    """The travel model, see `dqn.Travel`."""
 
-    speed: Traced[float] = limited(0.2, above=0)
-    """Driving speed, in metres per second."""
-    turn_rate: Traced[float] = limited(1.2, above=0)
-    """Turning rate, in radians per second."""
     view_distance: Traced[float] = limited(0.96, at_least=0)
     """Distance from which a robot looks at a PoI, in metres."""
-    look_seconds: Traced[float] = limited(0.7, above=0)
-    """Duration of a look, in seconds."""
 
 
 class ToursConfig(Section, place="team.tours"):
@@ -159,17 +149,14 @@ class ToursConfig(Section, place="team.tours"):
 
     states: int = limited(65536, at_least=1)
     """Number of states in which choices are tried, rounded up to whole chunks."""
-    tries: int = limited(4, at_least=2)
-    """Number of choices tried in each state."""
-    walk: Traced[int] = limited(8, at_least=0, at_most=10_000)
-    """Maximum number of choices made before the state in which alternatives are tried."""
     steps: int = limited(3200, at_least=0)
     """Gradient steps. With 0, no order is learned, and an auction orders the looks that pay, as
     with `dqn.task` = `map`."""
-    batch: int = limited(1024, at_least=1)
-    """States per gradient step."""
-    learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
-    """Initial learning rate of Adam; decays to zero along a cosine."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Initial learning rate of Adam; decays to zero along a cosine."""
+        return 2e-3
 
 
 class TeamConfig(Section, place="team"):
@@ -181,18 +168,10 @@ class TeamConfig(Section, place="team"):
     """Training of the network that orders a team's visits."""
     num_pois: tuple[int, int] = limited((3, 8), at_least=1, at_most=64)
     """Minimum and maximum number of PoIs in an episode."""
-    robots_each: int = limited(2, at_least=1, at_most=8)
-    """Maximum number of robots per modality in an episode; the minimum is one."""
     sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
     """Shortest and longest side of an episode's arena, in metres."""
-    alone: Traced[float] = limited(0.25, at_least=0, at_most=1)
-    """Share of episodes with one robot and no travel, as in the paper."""
-    partly_seen: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Share of the other episodes that start with some looks already taken."""
     second_cost: Traced[float] = limited(0.0, at_least=0)
     """Cost of each second in which a robot works, in units of the reward."""
-    max_steps: Traced[int] = limited(300, at_least=1, at_most=100_000)
-    """Maximum length of an episode, in choices."""
 
     def check(self) -> None:
         """Checks that each minimum is at most its maximum; raises `ConfigError`."""
@@ -230,35 +209,29 @@ class DqnConfig(Section, place="dqn"):
     discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
     """Discount factor, gamma: per step, or per second with `dqn.task` = `team`."""
     learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
-    """Initial learning rate of Adam."""
-    final_learning_rate: Traced[float] = limited(1e-5, at_least=0, at_most=1)
-    """Learning rate of the last epoch, reached along a cosine."""
-    epsilon_start: Traced[float] = limited(1.0, at_least=0, at_most=1)
-    """Probability of a random action, epsilon, in the first epoch."""
-    epsilon_min: Traced[float] = limited(0.01, at_least=0)
-    """Minimum probability of a random action."""
+    """Initial learning rate of Adam; decays to a hundredth along a cosine."""
+    epsilon_min: Traced[float] = limited(0.01, at_least=0, at_most=1)
+    """Minimum probability of a random action, epsilon, which starts at 1."""
     epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
     """Factor on epsilon per epoch."""
     target_period: Traced[int] = limited(50, at_least=1)
     """Epochs between updates of the target network."""
-    num_starts: int = limited(8192, at_least=1)
-    """Start states, prepared once and divided among the environments; a multiple of `num_envs`."""
-    chunk: int = limited(100, at_least=1)
-    """Epochs between reports of progress."""
 
     def check(self) -> None:
-        """Checks epsilon and what must divide what; raises `ConfigError`."""
-        is_lower = self.epsilon_min <= self.epsilon_start
-        most = f"must be at most epsilon_start = {self.epsilon_start}"
-        require(is_lower, self, "epsilon_min", most)
-        for field, unit in (
-            ("replay_capacity", "num_envs"),
-            ("num_starts", "num_envs"),
-            ("epochs", "chunk"),
-        ):
-            size = getattr(self, unit)
-            is_multiple = getattr(self, field) % size == 0
-            require(is_multiple, self, field, f"must be a multiple of {unit} = {size}")
+        """Checks that all environments fill the replay together; raises `ConfigError`."""
+        is_multiple = self.replay_capacity % self.num_envs == 0
+        expected = f"must be a multiple of num_envs = {self.num_envs}"
+        require(is_multiple, self, "replay_capacity", expected)
+
+    @property
+    def chunk(self) -> int:
+        """Epochs between reports of progress, which divide all epochs."""
+        return math.gcd(self.epochs, _MOST_IN_CHUNK)
+
+    @property
+    def num_starts(self) -> int:
+        """Start states, prepared once and divided among the environments."""
+        return _STARTS_EACH * self.num_envs
 
     @property
     def block(self) -> int:
@@ -283,7 +256,10 @@ class EvaluationConfig(Section, place="evaluation"):
     num_states: int = limited(4096, at_least=1, at_most=100_000)
     """Maximum number of map states in which policies are compared; if there are more, a stratified
     sample of them."""
-    value_points: int = limited(2048, at_least=1, at_most=100_000)
-    """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
     value_looks: int = limited(32, at_least=1, at_most=10_000)
     """Sample looks per class that approximate the distribution of looks."""
+
+    @property
+    def value_points(self) -> int:
+        """Maximum size of the grid on which look values are tabulated, see `dqn.optimum`."""
+        return _POINTS_PER_LOOK * self.value_looks

@@ -1,7 +1,9 @@
 """Settings of navigation and of missions."""
 
+from typing import NamedTuple
+
 from jaxsense.config.checks import limited, require
-from jaxsense.config.scene import ROBOT_RADIUS, TIMESTEP
+from jaxsense.config.scene import ROBOT_RADIUS
 from jaxsense.config.section import Section, Traced
 
 MAX_EPISODES = 100_000
@@ -10,43 +12,28 @@ NODES_PER_POI = 10
 """Number of waypoints of the roadmap around each PoI."""
 VIEW_SIDES = 16
 """Number of directions from which a PoI has viewpoints."""
+CONTROL_PERIOD = 0.1
+"""Seconds between a robot's decisions, and between its scans."""
+PLANNING_RADIUS = 0.1
+"""Radius of a robot in planning, in metres."""
+MARGIN = PLANNING_RADIUS - ROBOT_RADIUS
+"""Free space around a robot's body in planning, in metres."""
 
 
 class NavigationConfig(Section, place="navigation"):
     """Navigation of a robot: the paper's move_base, with the AMiRo's parameters."""
 
-    horizon: Traced[float] = limited(2.0, at_least=1, at_most=60)
-    """Length of the trajectories that a robot simulates to choose its speed, in seconds."""
-    robot_radius: Traced[float] = limited(0.1, above=ROBOT_RADIUS)
-    """Radius of a robot in planning, in metres; that of its body is 0.05."""
-    inflation: Traced[float] = limited(0.1, at_least=0)
-    """Distance to obstacles below which a trajectory costs more, in metres."""
-    view_distances: Traced[tuple[float, ...]] = limited(
-        (0.5, 0.9), above=0, min_items=1, max_items=20
-    )
-    """Distances of viewpoints from a PoI's centre, in metres."""
     view_range: Traced[float] = limited(1.0, above=0)
     """Maximum distance from which a robot scans a PoI, in metres."""
 
-    @property
-    def margin(self) -> float:
-        """Free space around a robot's body in planning, in metres."""
-        return self.robot_radius - ROBOT_RADIUS
 
+class Search(NamedTuple):
+    """Largest errors of a pose for which robots search their scans for a PoI."""
 
-class SearchConfig(Section, place="mission.localisation.search"):
-    """Robots with localisation errors search their scans for the PoI; off by default.
-
-    The detector judges all windows and distances that such errors could explain. A robot also
-    keeps a distance of at least `viewpoint.min_distance` plus `position` from the PoI.
-    """
-
-    position: float = limited(0.0, at_least=0, at_most=0.3)
-    """Largest error of a robot's position that the search allows for, in metres, for example three
-    times `position_error`."""
-    heading: float = limited(0.0, at_least=0, at_most=30)
-    """Largest error of a robot's heading that the search allows for, in degrees, for example three
-    times `heading_error`."""
+    position: float = 0.0
+    """In metres."""
+    heading: float = 0.0
+    """In degrees."""
 
     @property
     def applies(self) -> bool:
@@ -57,24 +44,28 @@ class SearchConfig(Section, place="mission.localisation.search"):
 class LocalisationConfig(Section, place="mission.localisation"):
     """Localisation errors, by which believed poses differ from true ones; 0 in all presets.
 
-    All errors are normally distributed, and those of x and y are independent.
+    Each setting has two numbers: metres for x and y, and degrees for the heading. Errors are normal
+    and independent.
     """
 
     in_training: bool = False
     """Whether detectors and policies also learn from looks with the constant errors; they never
     learn from errors that driving adds."""
-    position_error: Traced[float] = limited(0.0, at_least=0, at_most=1)
-    """Standard deviation of the constant error of a robot's x and y in a mission, in metres."""
-    heading_error: Traced[float] = limited(0.0, at_least=0, at_most=180)
-    """Standard deviation of the constant error of a robot's heading in a mission, in degrees."""
-    position_drift: Traced[float] = limited(0.0, at_least=0, at_most=1)
-    """Standard deviation of the errors of x and y that one metre of driving adds, in metres; it
-    grows with the square root of the distance."""
-    heading_drift: Traced[float] = limited(0.0, at_least=0, at_most=180)
-    """Standard deviation of the error of the heading that one metre of driving adds, in degrees; it
-    grows with the square root of the distance."""
-    search: SearchConfig = SearchConfig()
-    """Search of scans for the PoI, for robots with localisation errors."""
+    error: Traced[tuple[float, float]] = limited((0.0, 0.0), at_least=0, at_most=180)
+    """Standard deviations of a robot's constant error in a mission, in metres and degrees."""
+    drift: Traced[tuple[float, float]] = limited((0.0, 0.0), at_least=0, at_most=180)
+    """Standard deviations of the errors that one metre of driving adds, in metres and degrees; they
+    grow with the square root of the distance."""
+    search: tuple[float, float] = limited((0.0, 0.0), at_least=0, at_most=30)
+    """Largest errors, in metres and degrees, for which robots search their scans for the PoI, for
+    example three times `error`: the detector judges all windows and distances that they could explain,
+    and a robot keeps a distance of at least `viewpoint.min_distance` plus the first number."""
+
+    def check(self) -> None:
+        """Checks the limits of the errors of positions; raises `ConfigError`."""
+        for name, most in (("error", 1.0), ("drift", 1.0), ("search", 0.3)):
+            expected = f"must be at most {most} m and degrees, in this order"
+            require(getattr(self, name)[0] <= most, self, name, expected)
 
 
 class CommunicationConfig(Section, place="mission.communication"):
@@ -89,8 +80,6 @@ class CommunicationConfig(Section, place="mission.communication"):
     delay: Traced[float] = limited(0.0, at_least=0, at_most=3600)
     """Mean delay of a message, in seconds; each delay is drawn from 0 to twice the mean. Only with
     `own_maps`."""
-    period: Traced[float] = limited(1.0, above=0, at_most=3600)
-    """Seconds after which a robot repeats its message; it also sends one after each look."""
 
     def check(self) -> None:
         """Checks that messages are sent if they are lost or late; raises `ConfigError`."""
@@ -108,41 +97,22 @@ class MissionConfig(Section, place="mission"):
     custom policies. `jaxsense.evaluate` plays all of them."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     """Missions per policy at the end of a run."""
-    time_limit: Traced[float] = limited(120.0, above=0, at_most=3600)
+    time_limit: Traced[float] = limited(120.0, at_least=CONTROL_PERIOD, at_most=3600)
     """Maximum length of a mission, in seconds."""
-    control_period: float = 0.1
-    """Seconds between a robot's decisions, and between its scans."""
     auctions: Traced[bool] = True
     """Whether robots divide the PoIs that are worth a look among themselves by an auction, in which
-    they bid travel times, if their policy prescribes no order. Otherwise, they follow its values,
-    and `equal_values`, `avoids_targets` and `nearest_first` break ties."""
+    they bid travel times, if their policy prescribes no order. Otherwise, they follow values."""
     equal_values: Traced[float] = limited(0.1, at_least=0)
     """Tolerance, in units of the reward: actions whose values are this close to the best count as
-    equally good; see `avoids_targets` and `nearest_first`."""
-    nearest_first: Traced[bool] = True
-    """Whether a robot takes the nearest of equally good PoIs; otherwise the first."""
-    redecides: Traced[bool] = True
-    """Whether a robot under way decides again when the map changes."""
-    avoids_targets: Traced[bool] = True
-    """Whether a robot prefers, among equally good PoIs, those that no other robot heads for."""
+    equally good: a robot prefers PoIs that no other heads for, then the nearest."""
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     """Minimum probability of the most likely label for a scan to update the map."""
-    attempts: Traced[int] = limited(3, at_least=1)
-    """Number of failed looks or goals after which a robot gives up a PoI. Before it finishes, it
-    retries PoIs where it was stuck, with the same number of attempts."""
     localisation: LocalisationConfig = LocalisationConfig()
     """Localisation errors."""
     communication: CommunicationConfig = CommunicationConfig()
     """Messages between robots about their looks."""
 
     def check(self) -> None:
-        """Checks the control period, and that no policy repeats; raises `ConfigError`."""
+        """Checks that no policy repeats; raises `ConfigError`."""
         is_once = len(set(self.policies)) == len(self.policies)
         require(is_once, self, "policies", "must name no policy twice")
-        steps = self.control_period / TIMESTEP
-        is_multiple = abs(steps - round(steps)) < 1e-6 and 5 <= round(steps) <= 20
-        limits = f"from {5 * TIMESTEP} to {20 * TIMESTEP} s"
-        expected = f"must be a multiple of {TIMESTEP} s {limits}"
-        require(is_multiple, self, "control_period", expected)
-        is_long = self.time_limit >= self.control_period
-        require(is_long, self, "time_limit", "must be at least control_period")

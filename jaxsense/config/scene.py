@@ -14,6 +14,16 @@ ROBOT_RADIUS = 0.0495
 LIDAR_HEIGHT = 0.152
 """Height of an AMiRo's laser beams above the floor, in metres."""
 
+POI_HEIGHT = 0.2
+"""Height of a PoI, in metres; beams and cameras must not look over it."""
+
+MAX_BEARING = 20.0
+"""Largest angle between a robot's heading and the PoI that it looks at, to either side, in
+degrees."""
+
+CLEARANCE = 0.03
+"""Minimum free space around a robot at a viewpoint, in metres."""
+
 TIMESTEP = 0.01
 """Step of the physics, in seconds."""
 
@@ -34,8 +44,6 @@ class ArenaConfig(Section, place="arena"):
     poi_radius: float = limited(0.1, above=0)
     """Radius of a cylinder and half the side of a cube, in metres; unit of the sides of custom
     shapes."""
-    poi_height: float = limited(0.2, above=LIDAR_HEIGHT, at_most=10)
-    """Height of a PoI, in metres; more than 0.152, or the LiDAR looks over it."""
     poi_gap: float = limited(0.3, above=0)
     """Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
@@ -161,8 +169,6 @@ class LidarConfig(Section, place="lidar"):
     """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
     """Number of beams around the PoI's bearing that the detector reads."""
-    stride: int = limited(1, at_least=1)
-    """Step between the beams that the detector reads, in beams."""
     window_range: Traced[float] = limited(1.5, above=0)
     """Distance at which the detector's input is clipped, in metres; removes the background."""
 
@@ -172,7 +178,7 @@ class LidarConfig(Section, place="lidar"):
         require(self.max_range > self.min_range, self, "max_range", f"must be {least}")
         require(self.window_range > self.min_range, self, "window_range", f"must be {least}")
         require(self.range_noise <= self.max_range, self, "range_noise", f"must be {most}")
-        _check_window(self, self.num_beams)
+        _check_window(self, self.num_beams, 1)
 
 
 class CameraConfig(Section, place="camera"):
@@ -192,13 +198,7 @@ class CameraConfig(Section, place="camera"):
     """Maximum share of the light that may be missing in an image; the share is uniform from 0."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
     """Probability of a shadow: on one side of a random pixel of the image, only ambient
-    light remains."""
-    light_distance: Traced[float] = limited(0.5, above=0)
-    """Distance over which exposure, colour cast, low light and shadow change, in metres: their
-    correlation is a Gaussian function of the distance, with this standard deviation."""
-    light_time: Traced[float] = limited(60.0, above=0)
-    """Time over which exposure, colour cast, low light and shadow change, in seconds: their
-    correlation is a Gaussian function of time, too, with this standard deviation."""
+    light remains. It, exposure, cast and low light drift with time and place, see `sim.light`."""
     window: int = limited(80, at_least=1)
     """Number of pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)
@@ -206,7 +206,7 @@ class CameraConfig(Section, place="camera"):
 
     def check(self) -> None:
         """Checks the window; raises `ConfigError`."""
-        _check_window(self, self.num_pixels)
+        _check_window(self, self.num_pixels, self.stride)
 
 
 class ViewpointConfig(Section, place="viewpoint"):
@@ -216,12 +216,8 @@ class ViewpointConfig(Section, place="viewpoint"):
     """Shortest distance from the sensor to the PoI's centre, in metres."""
     max_distance: Traced[float] = limited(1.2, above=0)
     """Longest distance from the sensor to the PoI's centre, in metres."""
-    max_bearing: Traced[float] = limited(20.0, at_least=0, at_most=30)
-    """Largest angle between the robot's heading and the PoI, to either side, in degrees."""
     bearing_error: Traced[float] = limited(1.0, at_least=0, at_most=10)
     """Largest error of the bearing on which the detector's window is centred, in degrees."""
-    clearance: Traced[float] = limited(0.03, at_least=0)
-    """Minimum free space around a robot at a viewpoint, in metres."""
 
     def check(self) -> None:
         """Checks the order of distances; raises `ConfigError`."""
@@ -243,10 +239,8 @@ class SensorConfig(Checked, place="sensor"):
         require(is_function_name(self.make), self, "make", "must be package.module:function")
 
 
-def _check_window(sensor: LidarConfig | CameraConfig, num_rays: int) -> None:
+def _check_window(sensor: LidarConfig | CameraConfig, num_rays: int, stride: int) -> None:
     """Raises `ConfigError` unless a sensor's window fits its rays."""
-    stride = sensor.stride
-    require(stride <= num_rays, sensor, "stride", f"must be at most {num_rays}, its rays")
     most = (num_rays - 1) // stride + 1
     expected = f"must be at most {most}: it has {num_rays} rays, with a stride of {stride}"
     require(sensor.window <= most, sensor, "window", expected)

@@ -3,11 +3,59 @@
 import dataclasses
 import difflib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import cast, get_args, get_type_hints
 
 from jaxsense.config.checks import ConfigError
 from jaxsense.config.whole import Config
+
+_REMOVED: Mapping[str, Sequence[object]] = {
+    "mission.localisation.search": [{"position": 0.0, "heading": 0.0}],
+    "arena.poi_height": [0.2],
+    "lidar.stride": [1],
+    "camera.light_distance": [0.5],
+    "camera.light_time": [60.0],
+    "viewpoint.max_bearing": [20.0],
+    "viewpoint.clearance": [0.03],
+    "jmvae.alpha_start": [0.0, 0.4],
+    "jmvae.looks": [4],
+    "filter.hidden": [[32]],
+    "filter.looks": [6],
+    "filter.batch": [256],
+    "filter.learning_rate": [5e-3],
+    "mdp.unseen_variance": [20.0],
+    "team.travel.speed": [0.2],
+    "team.travel.turn_rate": [1.2],
+    "team.travel.look_seconds": [0.7],
+    "team.tours.tries": [4],
+    "team.tours.walk": [8],
+    "team.tours.batch": [1024, 64],
+    "team.tours.learning_rate": [2e-3],
+    "team.robots_each": [2],
+    "team.alone": [0.25],
+    "team.partly_seen": [0.5, 0.0],
+    "team.max_steps": [300],
+    "dqn.final_learning_rate": [1e-5],
+    "dqn.epsilon_start": [1.0],
+    "dqn.num_starts": [8192, 64],
+    "dqn.chunk": [100, 20],
+    "evaluation.value_points": [2048, 8192, 256],
+    "navigation.horizon": [2.0],
+    "navigation.robot_radius": [0.1],
+    "navigation.inflation": [0.1],
+    "navigation.view_distances": [[0.5, 0.9]],
+    "mission.control_period": [0.1],
+    "mission.nearest_first": [True],
+    "mission.redecides": [True],
+    "mission.avoids_targets": [True],
+    "mission.attempts": [3],
+    "mission.localisation.position_error": [0.0],
+    "mission.localisation.heading_error": [0.0],
+    "mission.localisation.position_drift": [0.0],
+    "mission.localisation.heading_drift": [0.0],
+    "mission.communication.period": [1.0],
+}
+"""Former settings with their values in all presets, which are constants now."""
 
 
 def as_plain(config: Config) -> dict[str, object]:
@@ -75,6 +123,11 @@ def _made(kind: object, stored: object, base: object, place: str) -> object:
     kinds, given = get_type_hints(kind), {}
     for name, value in stored.items():
         path = f"{place}.{name}".lstrip(".")
+        if path in _REMOVED and json.loads(json.dumps(value)) in _REMOVED[path]:
+            continue
+        if path in _REMOVED and name not in kinds:
+            allowed = " or ".join(map(str, _REMOVED[path]))
+            raise ConfigError(path, value, f"is no longer a setting: must be {allowed}")
         if name not in kinds:
             raise ConfigError(path, value, f"unknown setting{_suggestion(path)}")
         given[name] = _made(kinds[name], value, getattr(base, name, None), path)

@@ -14,9 +14,11 @@ from jaxsense.config.learning import (
     MdpConfig,
     TeamConfig,
 )
-from jaxsense.config.mission import MissionConfig, NavigationConfig
+from jaxsense.config.mission import PLANNING_RADIUS, MissionConfig, NavigationConfig
 from jaxsense.config.objects import require_words
 from jaxsense.config.scene import (
+    CLEARANCE,
+    MAX_BEARING,
     MODALITIES,
     ROBOT_RADIUS,
     ArenaConfig,
@@ -158,7 +160,7 @@ class Config(Section):
     def _check_viewpoints(self) -> None:
         """Viewpoints must be clear of the PoI, in range of the detectors, and show the PoI."""
         viewpoint, navigation = self.viewpoint, self.navigation
-        clear = self.arena.poi_extent + ROBOT_RADIUS + viewpoint.clearance
+        clear = self.arena.poi_extent + ROBOT_RADIUS + CLEARANCE
         expected = f"must be at least {clear:.3f} m, where the robot is clear of the PoI"
         require(viewpoint.min_distance >= clear, viewpoint, "min_distance", expected)
         most = self.arena.side / 2
@@ -169,23 +171,16 @@ class Config(Section):
         expected = f"must be at most viewpoint.max_distance = {viewpoint.max_distance} m"
         require(farthest <= viewpoint.max_distance, navigation, "view_range", expected)
         # A robot that searches keeps away by the error of its position.
-        searched = self.mission.localisation.search.position
-        nearest = viewpoint.min_distance + searched
-        nearest = max(self.arena.poi_extent + navigation.robot_radius, nearest)
-        distances = navigation.view_distances
-        is_between = nearest <= min(distances) <= max(distances) <= farthest
-        expected = (
-            f"must be from {nearest:.3f} m, where the robot is clear of the PoI"
-            f"{' by mission.localisation.search.position' if searched else ''}, to "
-            f"navigation.view_range = {farthest} m"
-        )
-        require(is_between, navigation, "view_distances", expected)
+        nearest = viewpoint.min_distance + self.mission.localisation.search[0]
+        nearest = max(self.arena.poi_extent + PLANNING_RADIUS, nearest)
+        expected = f"must be at least {nearest:.3f} m, where the robot is clear of the PoI"
+        require(nearest <= farthest, navigation, "view_range", expected)
 
         for name, sensor in {"camera": self.camera, "lidar": self.lidar}.items():
-            most = sensor.field_of_view / 2 - viewpoint.bearing_error
-            shows = name not in self.modalities or viewpoint.max_bearing <= most
-            half = f"half of {name}.field_of_view minus viewpoint.bearing_error"
-            require(shows, viewpoint, "max_bearing", f"must be at most {half}, {most:g} degrees")
+            least = 2 * (MAX_BEARING + viewpoint.bearing_error)
+            shows = name not in self.modalities or sensor.field_of_view >= least
+            expected = f"must be at least {least:g} degrees, or robots miss the PoIs they look at"
+            require(shows, sensor, "field_of_view", expected)
 
     def _check_profile(self) -> None:
         """A profile needs three beams on a PoI, and a window that reaches it and not behind."""
@@ -194,13 +189,13 @@ class Config(Section):
         require(lidar.window_range >= farthest, lidar, "window_range", expected)
         sine = min(self.arena.poi_half_width / farthest, 1.0)
         widest = math.degrees(2 * math.asin(sine)) / 3
-        least = math.ceil(lidar.field_of_view * lidar.stride / widest) + 1
+        least = math.ceil(lidar.field_of_view / widest) + 1
         expected = (
-            f"must be at least {least} to learn from scans: so that three of the beams that are "
-            f"read hit a PoI at viewpoint.max_distance = {farthest} m"
+            f"must be at least {least} to learn from scans: so that three beams hit a "
+            f"PoI at viewpoint.max_distance = {farthest} m"
         )
         require(lidar.num_beams >= least, lidar, "num_beams", expected)
-        pitch = lidar.field_of_view / (lidar.num_beams - 1) * lidar.stride
+        pitch = lidar.field_of_view / (lidar.num_beams - 1)
         most = math.floor(180 / pitch) + 1
         expected = f"must be from 3 to {most} to learn from scans: at most 180 degrees"
         require(3 <= lidar.window <= most, lidar, "window", expected)

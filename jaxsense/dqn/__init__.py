@@ -26,3 +26,4 @@ from jaxsense.dqn.team_mdp import TeamMdp as TeamMdp
 from jaxsense.dqn.team_mdp import TeamState as TeamState
 from jaxsense.dqn.training import DqnState as DqnState
 from jaxsense.dqn.training import train as train
+from jaxsense.dqn.travel import Travel as Travel

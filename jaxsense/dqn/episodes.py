@@ -205,7 +205,7 @@ def run_team(
 
     def play(carry: _TeamCarry) -> _TeamCarry:
         state, step = carry.state, carry.state.map.steps
-        times = team_mdp.travel_times(mdp.config.travel, state.team)
+        times = team_mdp.travel_times(mdp.travel, state.team)
         known = Known(state.map.belief, carry.looks, uniform, state.team, times, state.agent)
         action, memory = act(jax.random.fold_in(policy_key, step), state, known, carry.memory)
         after, outcome = team_mdp.step(jax.random.fold_in(looks_key, step), mdp, state, action)

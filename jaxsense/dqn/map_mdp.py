@@ -86,6 +86,11 @@ class MapMdp:
         return ()
 
     @property
+    def max_steps(self) -> Int[Array, ""] | int:
+        """Maximum length of an episode, in actions."""
+        return self.config.max_steps
+
+    @property
     def num_modalities(self) -> int:
         """M, the number of sensors."""
         return self.looks.num_modalities

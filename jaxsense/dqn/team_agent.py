@@ -18,6 +18,7 @@ from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.places import Places
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import Names, Team, TeamMdp
+from jaxsense.dqn.travel import Travel
 
 _NOT_WORTH_IT = -1e6  # s, below minus any tour
 
@@ -88,7 +89,8 @@ class TeamAgent:
           places: draws positions of PoIs and robots.
           names: of the sensors.
         """
-        return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names)
+        travel = Travel(self.config.travel.view_distance)
+        return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names, travel)
 
     def environment(self, mdp: TeamMdp, modality: Index) -> TeamEnvironment:
         """What the agent learns in.
@@ -116,7 +118,7 @@ class TeamAgent:
           team: robots and PoIs at this moment.
           robot: `[]` int32, the robot that chooses.
         """
-        travel, number = self.config.travel, self.num_modalities
+        travel, number = Travel(self.config.travel.view_distance), self.num_modalities
         return team_mdp.observation(travel, belief, team, robot, number).reshape(-1)
 
     def q(

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import TeamConfig, TravelConfig
+from jaxsense.config import TeamConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
 from jaxsense.dqn.places import Places
-from jaxsense.dqn.travel import move, travel_seconds
+from jaxsense.dqn.travel import Travel, move, travel_seconds
 
 TIME_SCALE = 10.0
 """Unit of travel times in observations, in seconds."""
@@ -84,16 +84,26 @@ class TeamMdp:
     """The MDP of a team that shares one map.
 
     Attributes:
-      config: size of teams, travel, and the price of time.
+      config: numbers of PoIs and the price of time.
       map: the map MDP, with the maximum number of PoIs.
       places: draws positions of PoIs and robots.
       modalities: names of the sensors, in the order of their indices.
+      travel: the travel model.
+      alone: share of episodes with one robot and no travel, as in the paper.
+      partly_seen: share of the other episodes that start with some looks already taken.
+      max_steps: maximum length of an episode, in choices.
+      robots_each: maximum number of robots per modality in an episode; the minimum is one.
     """
 
     config: TeamConfig
     map: MapMdp
     places: Places
     modalities: Names = struct.field(pytree_node=False)
+    travel: Travel
+    alone: jax.Array | float = 0.25
+    partly_seen: jax.Array | float = 0.5
+    max_steps: jax.Array | int = 300
+    robots_each: int = struct.field(pytree_node=False, default=2)
 
     @property
     def num_features(self) -> int:
@@ -107,7 +117,7 @@ class TeamMdp:
           state: the current state.
           robot: `[]` int32.
         """
-        belief, travel, number = state.map.belief, self.config.travel, self.map.num_modalities
+        belief, travel, number = state.map.belief, self.travel, self.map.num_modalities
         return observation(travel, belief, state.team, robot, number)
 
     def time_price(self, team: Team, seconds: Float[Array, ""]) -> Float[Array, ""]:
@@ -120,17 +130,17 @@ class TeamMdp:
         return self.config.second_cost * seconds * jnp.sum(team.works, dtype=seconds.dtype)
 
 
-def travel_times(config: TravelConfig, team: Team) -> Float[Array, "R N"]:
+def travel_times(travel: Travel, team: Team) -> Float[Array, "R N"]:
     """Time until each robot has looked at each PoI, see `travel_seconds`.
 
     Args:
-      config: the travel model.
+      travel: the travel model.
       team: robots and PoIs at this moment.
 
     Returns:
       `[R, N]` seconds.
     """
-    return jax.vmap(lambda pose: travel_seconds(config, pose, team.positions))(team.poses)
+    return jax.vmap(lambda pose: travel_seconds(travel, pose, team.positions))(team.poses)
 
 
 def own_seconds(observed: Float[Array, "F N ..."], latent_size: int) -> Float[Array, "N ..."]:
@@ -154,12 +164,12 @@ def num_features(latent_size: int, num_modalities: int) -> int:
 
 
 def observation(
-    config: TravelConfig, belief: Belief, team: Team, agent: Int[Array, ""], num_modalities: int
+    travel: Travel, belief: Belief, team: Team, agent: Int[Array, ""], num_modalities: int
 ) -> Float[Array, "F N"]:
     """What a robot knows when it chooses.
 
     Args:
-      config: the travel model.
+      travel: the travel model.
       belief: `[N, D]` the map.
       team: robots and PoIs at this moment.
       agent: `[]` int32, the robot that chooses.
@@ -176,7 +186,7 @@ def observation(
     """
     checks.require_shape("belief.mean", belief.mean, (None, None))
     checks.require_positive("belief.std", belief.std)
-    times = travel_times(config, team)
+    times = travel_times(travel, team)
     soon = jnp.exp(-times / TIME_SCALE)
     robots, pois = jnp.arange(team.poses.shape[0]), jnp.arange(team.positions.shape[0])
     is_other = team.works & (robots != agent)
@@ -245,7 +255,7 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
       key: random key.
       mdp: the MDP.
       modality: `[R]` int32 sensors of the robots, which all work; by default the team is random. In
-        a share of these episodes, `TeamConfig.alone`, one robot is alone and shares its position
+        a share `mdp.alone` of these episodes, one robot is alone and shares its position
         with all PoIs: the map MDP of the paper, where only looks take time.
 
     Raises:
@@ -257,7 +267,7 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
     fewest, most = config.num_pois
     number = jax.random.randint(number_key, (), fewest, most + 1)
     if modality is None:
-        alone = jax.random.bernoulli(alone_key, config.alone)
+        alone = jax.random.bernoulli(alone_key, mdp.alone)
         modality, works = _random_team(team_key, mdp, alone)
     else:
         checks.require_shape("modality", modality, (None,))
@@ -269,7 +279,7 @@ def reset(key: Key, mdp: TeamMdp, modality: Int[Array, " R"] | None = None) -> T
     checks.require_shape("poses", poses, (num_robots, 3))
 
     some_key, share_key, looks_key = jax.random.split(seen_key, 3)
-    starts_late = alone | jax.random.bernoulli(some_key, config.partly_seen)
+    starts_late = alone | jax.random.bernoulli(some_key, mdp.partly_seen)
     # Uniform share, so that late states are as frequent as early ones.
     share = jnp.where(starts_late, jax.random.uniform(share_key), 0.0)
     seen = jax.random.bernoulli(looks_key, share, (num_pois, mdp.map.num_modalities))
@@ -304,7 +314,7 @@ def _look(
 
 def _random_team(key: Key, mdp: TeamMdp, alone: jax.Array) -> tuple[jax.Array, jax.Array]:
     """`[R]` int32 modalities and `[R]` bool `works`: one or more of each modality, or one alone."""
-    num_modalities, most = mdp.map.num_modalities, mdp.config.robots_each
+    num_modalities, most = mdp.map.num_modalities, mdp.robots_each
     count_key, single_key = jax.random.split(key)
     counts = jax.random.randint(count_key, (num_modalities,), 1, most + 1)
     # Robots of one modality side by side.
@@ -336,7 +346,7 @@ def step(
     checks.require_key(key)
     checks.require_shape("action", action, ())
     checks.require_index("action", action, mdp.map.num_pois + 1)
-    num_pois, team, travel = mdp.map.num_pois, state.team, mdp.config.travel
+    num_pois, team, travel = mdp.map.num_pois, state.team, mdp.travel
     robots = jnp.arange(team.poses.shape[0])
     is_agent = robots == state.agent
     target = jnp.where(is_agent, action, team.target)
@@ -377,6 +387,6 @@ def step(
     return state, Outcome(
         reward=reward,
         terminated=terminated,
-        truncated=~terminated & (after.steps >= mdp.config.max_steps),
+        truncated=~terminated & (after.steps >= mdp.max_steps),
         seconds=seconds,
     )

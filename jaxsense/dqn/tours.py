@@ -60,6 +60,9 @@ class _Now:
     read: jax.Array
 
 
+BATCH = 1024
+_TRIES = 4  # choices in each state
+_WALK = 8  # most choices before it
 _NEAR = 5.0  # s; each further one makes a trial e times as rare
 _ERROR = 3.0  # s, above which an error counts linearly
 
@@ -81,39 +84,38 @@ class Trials:
     seconds: jax.Array
 
 
-def try_choices(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, number: int) -> Trials:
+def try_choices(key: Key, mdp: TeamMdp, policy: Policy, number: int) -> Trials:
     """Tries choices in random states.
 
     Args:
       key: random key.
       mdp: the MDP.
       policy: of all robots, before and after the choice.
-      config: how many choices are tried, and how far from a start.
       number: B, of states.
 
     Returns:
       `[..., B]` trials.
     """
     # Alone, all PoIs share a position, so there is no order to learn.
-    mdp = dataclasses.replace(mdp, config=dataclasses.replace(mdp.config, alone=0.0))
+    mdp = dataclasses.replace(mdp, alone=0.0)
     keys = jax.random.split(key, number)
-    return jax.vmap(lambda key: _trial(key, mdp, policy, config), out_axes=-1)(keys)
+    return jax.vmap(lambda key: _trial(key, mdp, policy), out_axes=-1)(keys)
 
 
-def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trials:
+def _trial(key: Key, mdp: TeamMdp, policy: Policy) -> Trials:
     """The trials from one state, `[F * N]` and `[N]`."""
     start_key, walk_key, tried_key, play_key = jax.random.split(key, 4)
     first = team_mdp.reset(start_key, mdp)
     read = jax.vmap(policy.read)(first.map.belief, jnp.any(first.map.seen, axis=-1))
-    now = _some_way_on(walk_key, mdp, policy, config, _Now(first, read))
+    now = _some_way_on(walk_key, mdp, policy, _Now(first, read))
     state, num_pois = now.state, mdp.map.num_pois
     values = policy.values(now.read, state)
     is_open = values[:-1] > values[-1]
-    travel = mdp.config.travel
+    travel = mdp.travel
     pose = state.team.poses[state.agent]
     times = travel_seconds(travel, pose, state.team.positions)
     rank = jnp.where(is_open, jax.random.gumbel(tried_key, (num_pois,)) - times / _NEAR, -jnp.inf)
-    tried = jax.lax.top_k(rank, min(config.tries, num_pois))[1]
+    tried = jax.lax.top_k(rank, min(_TRIES, num_pois))[1]
     seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, now, poi))(tried)
     is_choice = jnp.sum(is_open) > 1
     observation = team_mdp.observation(
@@ -126,10 +128,10 @@ def _trial(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig) -> Trial
     )
 
 
-def _some_way_on(key: Key, mdp: TeamMdp, policy: Policy, config: ToursConfig, now: _Now) -> _Now:
-    """Follows the policy for up to `config.walk` random choices."""
+def _some_way_on(key: Key, mdp: TeamMdp, policy: Policy, now: _Now) -> _Now:
+    """Follows the policy for up to `_WALK` random choices."""
     number_key, step_key = jax.random.split(key)
-    number = jax.random.randint(number_key, (), 0, config.walk + 1)
+    number = jax.random.randint(number_key, (), 0, _WALK + 1)
 
     def advance(i: jax.Array, now: _Now) -> _Now:
         after, terminated = _follow(jax.random.fold_in(step_key, i), mdp, policy, now)
@@ -148,7 +150,7 @@ def _seconds_to_end(key: Key, mdp: TeamMdp, policy: Policy, now: _Now, poi: jax.
         return jnp.where(now.team.works, now.seconds, ends)
 
     def goes_on(carry: tuple[_Now, jax.Array, jax.Array]) -> jax.Array:
-        return jnp.any(carry[0].state.team.works) & (carry[2] < mdp.config.max_steps)
+        return jnp.any(carry[0].state.team.works) & (carry[2] < mdp.max_steps)
 
     def advance(carry: tuple[_Now, jax.Array, jax.Array]):
         now, ends, i = carry
@@ -235,7 +237,7 @@ class Fitting:
     """The fit of a network to the differences between choices tried from the same state.
 
     Attributes:
-      config: batch, learning rate and steps.
+      config: steps and learning rate.
       trials: all so far.
       network: of a team.
       latent_size: D.
@@ -258,7 +260,7 @@ class Fitting:
         """
         counts = jnp.any(self.trials.is_tried, axis=0)
         first = jnp.argsort(~counts)
-        drawn = jax.random.uniform(key, (number, self.config.batch)) * jnp.sum(counts)
+        drawn = jax.random.uniform(key, (number, min(BATCH, self.config.states))) * jnp.sum(counts)
         return first[jnp.floor(drawn).astype(jnp.int32)]
 
     def loss(

@@ -21,6 +21,8 @@ from jaxsense.dqn.environments import Environment
 
 S = TypeVar("S")
 _EVALUATED = 10  # epochs
+_FIRST_EPSILON = 1.0
+_FINAL_RATE = 0.01  # share of the learning rate that is left in the last epoch
 
 
 @pytree
@@ -220,7 +222,7 @@ def _epoch(
 ) -> tuple[DqnState[S], EpochInfo]:
     """One step of each environment and `config.updates` gradient steps."""
     decay = jax.lax.pow(jnp.asarray(config.epsilon_decay, jnp.float32), state.epoch)
-    epsilon = jnp.maximum(config.epsilon_min, config.epsilon_start * decay)
+    epsilon = jnp.maximum(config.epsilon_min, _FIRST_EPSILON * decay)
     started = _restart(draws.start, state.envs, shares, state.done)
     envs, has_ended, transitions, values = _explore(
         environment, config, state.params, started, epsilon, draws
@@ -323,7 +325,7 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
     schedule = optax.cosine_decay_schedule(
         config.learning_rate,
         config.epochs * config.updates,
-        config.final_learning_rate / config.learning_rate,
+        _FINAL_RATE,
     )
     # Flattened: for networks this small, per-array overhead dominates.
     return optax.flatten(optax.adam(schedule))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
+from jaxsense.config import CONTROL_PERIOD, Search
 from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
@@ -15,6 +16,7 @@ from jaxsense.mission.groups import where_due
 from jaxsense.mission.maps import Learned, map_of
 from jaxsense.mission.memory import Evidence
 from jaxsense.mission.state import (
+    ATTEMPTS,
     BACKING,
     DRIVING,
     ENDED,
@@ -98,7 +100,7 @@ def approach(
     is_stuck &= time - own.progress_at > STUCK_TIME
     is_back = (own.phase == BACKING) & (time >= own.backs_off_until)
 
-    failure = _fail(own, is_stuck, config.mission.attempts)
+    failure = _fail(own, is_stuck)
     phase = jnp.select(
         [arrives, is_blocked, is_stuck, is_back], [FACING, IDLE, BACKING, IDLE], own.phase
     )
@@ -144,14 +146,13 @@ def steer(mission: Mission, state: MissionState, robot: Index, course: Course) -
     config, scene, phase = mission.config, state.scene, course.phase
     aim = localisation.aimed_at(course.waypoint, scene.poses[robot], state.pose_error[robot])
     drive = navigation.drive_to(
-        config.navigation,
         config.arena,
         scene.layout,
         scene.poses,
         state.robots.command,
         robot,
         aim,
-        config.mission.control_period,
+        CONTROL_PERIOD,
         backs_off=(phase == BACKING) | course.makes_room,
     )
     turn = navigation.face(course.bearing)
@@ -183,10 +184,10 @@ class _Failure:
     gives_up: Bool[Array, " N"]
 
 
-def _fail(own: Robots, applies: Bool[Array, ""], attempts: int) -> _Failure:
+def _fail(own: Robots, applies: Bool[Array, ""]) -> _Failure:
     """Counts a failure of a robot at its viewpoint, if it `applies`."""
     failures = own.attempts + applies
-    gives_up = applies & (failures >= attempts)
+    gives_up = applies & (failures >= ATTEMPTS)
     return _Failure(
         attempts=failures,
         excluded=jnp.where(applies, own.excluded.at[own.view].set(True), own.excluded),
@@ -300,7 +301,7 @@ def _look(
 ) -> _Look:
     """Simulates a scan; it detects a PoI that is there if the detector is confident enough."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
-    search = mission.config.mission.localisation.search
+    search = Search(*mission.config.mission.localisation.search)
     wide = tuple(searching.widened(each, search) for each in world.sensors)
     world = dataclasses.replace(world, sensors=wide)
     time = mission.time(state)
@@ -328,7 +329,7 @@ def _write(
     poi, detects, learned = aim.poi, aim.scans & look.detects, look.learned
     modality = mission.modalities[robot]
     own = state.robot(robot)
-    failure = _fail(own, aim.scans & ~detects, mission.config.mission.attempts)
+    failure = _fail(own, aim.scans & ~detects)
     state = state.with_robot(
         robot,
         attempts=failure.attempts,

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsense.config import Config
+from jaxsense.config import PLANNING_RADIUS, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.mission import memory, roadmap
@@ -174,14 +174,14 @@ def _random_poses(
     key: Key, config: Config, layout: arenas.Layout, paths: Roadmap
 ) -> Float[Array, "R 3"]:
     """Random poses with room around the robots and, where possible, paths to all PoIs."""
-    num_robots, settings = len(config.carried), config.navigation
+    num_robots = len(config.carried)
     draws = jax.random.uniform(key, (num_robots, 3, _NUM_CANDIDATES), minval=-1.0)
-    reach = config.arena.side / 2 - settings.robot_radius
+    reach = config.arena.side / 2 - PLANNING_RADIUS
     candidates = reach * jnp.swapaxes(draws[:, :2], 1, 2)
 
     def room_at(position: jax.Array) -> jax.Array:
         to_pois = jnp.linalg.norm(layout.position - position[None], axis=-1)
-        room = jnp.min(to_pois) - config.arena.poi_extent - settings.robot_radius
+        room = jnp.min(to_pois) - config.arena.poi_extent - PLANNING_RADIUS
         # A corner behind a PoI may have no way out.
         has_paths = jnp.all(roadmap.reachable(config, layout, paths, position))
         return jnp.where(has_paths, room, room - config.arena.side)
@@ -192,7 +192,7 @@ def _random_poses(
             first, free = found
             some = jax.lax.dynamic_slice_in_dim(candidates[robot], first, _CHECKED_AT_ONCE)
             apart = jnp.linalg.norm(some[:, None] - taken[None], axis=-1)
-            beside = jnp.min(apart, axis=-1) - 3 * settings.robot_radius
+            beside = jnp.min(apart, axis=-1) - 3 * PLANNING_RADIUS
             room = jnp.minimum(jax.vmap(room_at)(some), beside)
             free = jax.lax.dynamic_update_slice_in_dim(free, room, first, 0)
             return first + _CHECKED_AT_ONCE, free

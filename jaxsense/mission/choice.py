@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import MissionConfig, TravelConfig
+from jaxsense.config import MissionConfig
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import rules, team_mdp
 from jaxsense.dqn.policies import Known, Policy
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn.travel import Travel
 from jaxsense.models import Models
 from jaxsense.vae.novelty import Novelty
 
@@ -75,7 +76,7 @@ def choose(settings: MissionConfig, opinion: Opinion, known: Known) -> Int[Array
     tolerance = jnp.where(opinion.counts_time, 0.0, settings.equal_values)
     of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
-    by_values = _by_values(settings, known, is_best)
+    by_values = _by_values(known, is_best)
     by_auction = jnp.argmax(rules.auction(opinion.gains, known.times, known.team, known.robot))
     is_auction = settings.auctions & opinion.is_unordered & ~opinion.counts_time
     choice = jnp.where(is_auction, by_auction, by_values)
@@ -84,7 +85,7 @@ def choose(settings: MissionConfig, opinion: Opinion, known: Known) -> Int[Array
 
 
 def times_to_new_looks(
-    travel: TravelConfig, novelty: Novelty, team: Team, apart: Float[Array, "R N K"]
+    travel: Travel, novelty: Novelty, team: Team, apart: Float[Array, "R N K"]
 ) -> Float[Array, "R N"]:
     """Seconds until each robot has looked at each PoI from where a look is new.
 
@@ -102,7 +103,7 @@ def times_to_new_looks(
     return team_mdp.travel_times(travel, team) + metres / travel.speed
 
 
-def _by_values(settings: MissionConfig, known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
+def _by_values(known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
     """One of the PoIs with the best values, by the rules; N if there is none."""
     team, robot = known.team, known.robot
     pois, robots = jnp.arange(team.positions.shape[0]), jnp.arange(team.poses.shape[0])
@@ -110,7 +111,6 @@ def _by_values(settings: MissionConfig, known: Known, is_best: Bool[Array, " N"]
     heads = team.target[:, None] == pois[None]
     is_others = jnp.any(heads & (robots != robot)[:, None], axis=0)
     # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
-    rank = jnp.where(settings.nearest_first, distance, pois)
-    rank += _KEPT * heads[robot] + _HEADED_FOR * (is_others & settings.avoids_targets)
+    rank = distance + _KEPT * heads[robot] + _HEADED_FOR * is_others
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
     return jnp.where(jnp.any(is_best), poi, pois.shape[0])

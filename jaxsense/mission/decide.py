@@ -6,13 +6,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsense.config import MARGIN
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn.travel import Travel
 from jaxsense.mission import roadmap
 from jaxsense.mission.choice import Opinion, ask, choose, times_to_new_looks
 from jaxsense.mission.maps import map_of
 from jaxsense.mission.state import (
+    ATTEMPTS,
     BACKING,
     DRIVING,
     ENDED,
@@ -43,7 +46,6 @@ def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, "
     own = state.robot(robot)
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
     has_news = map_of(mission, state, robot).version != own.decided_on
-    has_news &= mission.config.mission.redecides
     return (own.phase == IDLE) | (is_under_way & has_news)
 
 
@@ -129,7 +131,7 @@ def set_out(
     backs_off, time = sets_out & found.waits, mission.time(state)
     attempts += backs_off
     gives_up = sets_out & ~has_path
-    gives_up |= backs_off & (attempts >= config.mission.attempts)
+    gives_up |= backs_off & (attempts >= ATTEMPTS)
     sets_out_now = sets_out & ~is_exhausted & ~found.waits
     poi = jnp.minimum(action, config.arena.num_pois - 1)
     nothing_left = decides & (action == config.arena.num_pois)
@@ -197,7 +199,9 @@ def known_to(mission: Mission, models: Models, state: MissionState, robot: Index
         looks=known.times_seen,
         log_posterior=known.log_posterior,
         team=team,
-        times=times_to_new_looks(mission.config.team.travel, models.novelty, team, apart),
+        times=times_to_new_looks(
+            Travel(mission.config.team.travel.view_distance), models.novelty, team, apart
+        ),
         robot=jnp.asarray(robot),
     )
 
@@ -233,7 +237,7 @@ def _best_view(
     poi = jnp.minimum(target, config.arena.num_pois - 1)
     position, modality = state.believed_poses[robot, :2], mission.modalities[robot]
     length = roadmap.lengths(config, scene.layout, state.roadmap, position, poi)
-    positions, margin = state.roadmap.viewpoints[poi], config.navigation.margin
+    positions, margin = state.roadmap.viewpoints[poi], MARGIN
     is_free = _room(mission, state, robot, poi, positions, margin) > 0
     length += jnp.where(is_free, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
@@ -266,7 +270,7 @@ def is_taken(
       view: index of the viewpoint.
     """
     position = state.roadmap.viewpoints[poi, view][None]
-    return _room(mission, state, robot, poi, position, mission.config.navigation.margin)[0] <= 0
+    return _room(mission, state, robot, poi, position, MARGIN)[0] <= 0
 
 
 def sees(
@@ -283,7 +287,7 @@ def sees(
     config, position = mission.config, state.believed_poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position[poi] - position)
     # A robot may be nearer than it believes.
-    nearer = config.mission.localisation.search.position
+    nearer = config.mission.localisation.search[0]
     in_range = distance >= config.viewpoint.min_distance + nearer
     in_range &= distance <= config.navigation.view_range
     return in_range & (_room(mission, state, robot, poi, position[None], 0.0)[0] > 0)

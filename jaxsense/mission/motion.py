@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from jaxsense.config import ArenaConfig, Config
+from jaxsense.config import CONTROL_PERIOD, ArenaConfig, Config
 from jaxsense.core.types import pytree
 from jaxsense.mission import navigation
 from jaxsense.mission.groups import where_due
@@ -69,7 +69,7 @@ def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Ar
 def _is_near(config: Config, layout: Layout, poses: Float[Array, "B R 3"]) -> Bool[Array, " B"]:
     """Whether any robot can touch anything within the period."""
     # Two robots may drive at each other; with a margin for the lag of the wheels.
-    reach, lag = amiro.MAX_SPEED * config.mission.control_period, 0.005
+    reach, lag = amiro.MAX_SPEED * CONTROL_PERIOD, 0.005
     around = functools.partial(navigation.clearances, config.arena)
     to_fixed, to_robot = jax.vmap(around)(layout, poses)
     return jnp.any((to_fixed < reach + lag) | (to_robot < 2 * reach + lag), axis=-1)
@@ -126,5 +126,5 @@ def _integrate(
         smallest = jnp.minimum(motion.clearance, clearance)
         return dataclasses.replace(after, clearance=smallest), None
 
-    substeps = round(mission.config.mission.control_period / arenas.TIMESTEP)
+    substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
     return jax.lax.scan(substep, motion, length=substeps)[0]

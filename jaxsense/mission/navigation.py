@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import ArenaConfig, NavigationConfig
+from jaxsense.config import PLANNING_RADIUS, ArenaConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Index, others, product
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 
 _BACKWARD_SPEED = 0.1  # m/s
+_HORIZON = 2.0  # s, length of a trajectory
+_INFLATION = 0.1  # m, from obstacles, below which a trajectory costs more
 _NUM_SPEEDS = 6  # that the planner tries, one of them backwards
 _NUM_TURN_RATES = 21  # that it tries; odd, so that one goes straight
 _SAMPLE_TIMES = (0.1, 0.2, 0.3, 0.5, 0.75, 1.0)  # shares of the horizon
@@ -144,7 +146,6 @@ class _Frame(NamedTuple):
 
 @jax.named_scope("mission.drive_to")
 def drive_to(
-    settings: NavigationConfig,
     arena: ArenaConfig,
     layout: Layout,
     poses: Float[Array, "R 3"],
@@ -156,7 +157,7 @@ def drive_to(
 ) -> Float[Array, "2"]:
     """Command that brings a robot to a waypoint soonest without touching anything.
 
-    Excludes arcs that come closer to something than `robot_radius` minus 5 mm, which allows for
+    Excludes arcs closer to something than the planning radius minus 5 mm, which allows for
     their coarse samples, unless they lead away from what is too close already. PoIs are circles
     that hold every shape. Other robots may stand or go straight on; an arc must be clear of both.
     The cost of an arc is the minimum time to the waypoint over the samples where the robot may
@@ -164,7 +165,6 @@ def drive_to(
     plus a penalty within the inflation around obstacles.
 
     Args:
-      settings: of the planner.
       arena: its sizes.
       layout: positions of the PoIs; their shapes are not used.
       poses: `[R, 3]` of all robots.
@@ -181,15 +181,13 @@ def drive_to(
     checks.require_shape("poses", poses, (None, 3))
     checks.require_shape("commands", commands, (len(poses), 2))
     pose, present = poses[robot], commands[robot]
-    arcs = _arcs(settings, present[1], seconds)
+    arcs = _arcs(present[1], seconds)
     frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
-    map_room, map_room_now = _room_of_map(settings, arena, layout, frame, arcs)
-    room, room_now = _room_beside(
-        settings, frame, arcs, others(poses, robot), others(commands, robot)
-    )
+    map_room, map_room_now = _room_of_map(arena, layout, frame, arcs)
+    room, room_now = _room_beside(frame, arcs, others(poses, robot), others(commands, robot))
     room, room_now = jnp.minimum(map_room, room), jnp.minimum(map_room_now, room_now)
-    beside = sidestep(settings, arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
-    arrival = _arrival(settings, arcs, frame, beside, map_room)
+    beside = sidestep(arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
+    arrival = _arrival(arcs, frame, beside, map_room)
     is_safe = jax.lax.cummin(room, axis=1) >= jnp.minimum(room_now - 1e-4, -_GRAZE)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
     value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
@@ -197,10 +195,10 @@ def drive_to(
 
 
 def _room_of_map(
-    settings: NavigationConfig, arena: ArenaConfig, layout: Layout, frame: _Frame, arcs: _Arcs
+    arena: ArenaConfig, layout: Layout, frame: _Frame, arcs: _Arcs
 ) -> tuple[jax.Array, jax.Array]:
     """Metres to walls and PoIs, `[S, T]` from the arcs and `[]` from the robot now."""
-    x, y, reach = arcs.x, arcs.y, settings.robot_radius
+    x, y, reach = arcs.x, arcs.y, PLANNING_RADIUS
     world_x, world_y = frame.in_world(x, y)
     room = arena.side / 2 - jnp.maximum(jnp.abs(world_x), jnp.abs(world_y)) - reach
     room_now = arena.side / 2 - jnp.max(jnp.abs(frame.pose[:2])) - reach
@@ -211,7 +209,6 @@ def _room_of_map(
 
 
 def _room_beside(
-    settings: NavigationConfig,
     frame: _Frame,
     arcs: _Arcs,
     poses: Float[Array, "K 3"],
@@ -225,7 +222,7 @@ def _room_beside(
     course, driven = poses[:, 2] - frame.pose[2], arcs.times[None] * speed[:, None]
     x = at_x[:, None] + driven * jnp.cos(course)[:, None]
     y = at_y[:, None] + driven * jnp.sin(course)[:, None]
-    keep = 2 * settings.robot_radius
+    keep = 2 * PLANNING_RADIUS
     room_now = jnp.min(jnp.hypot(at_x, at_y), initial=jnp.inf) - keep
     return _to_nearest(arcs, x, y) - keep, room_now
 
@@ -243,7 +240,6 @@ def _to_nearest(arcs: _Arcs, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _arrival(
-    settings: NavigationConfig,
     arcs: _Arcs,
     frame: _Frame,
     goal: Float[Array, "2"],
@@ -257,8 +253,7 @@ def _arrival(
     turn = jnp.arctan2(jnp.abs(beside), ahead)
     # The direction of a near waypoint is meaningless.
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
-    inflation = jnp.maximum(settings.inflation, 1e-6)
-    cost = _INFLATION_COST * jnp.clip(1.0 - jax.lax.cummin(room, axis=1) / inflation, 0.0, 1.0)
+    cost = _INFLATION_COST * jnp.clip(1.0 - jax.lax.cummin(room, axis=1) / _INFLATION, 0.0, 1.0)
     return arcs.times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
 
 
@@ -281,7 +276,6 @@ def _best(
 
 @jax.named_scope("mission.sidestep")
 def sidestep(
-    settings: NavigationConfig,
     arena: ArenaConfig,
     layout: Layout,
     position: Float[Array, "2"],
@@ -291,7 +285,6 @@ def sidestep(
     """Position to head for on a straight line that another robot may block.
 
     Args:
-      settings: of the planner.
       arena: its sizes.
       layout: positions of the PoIs.
       position: `[2]` of the robot, in metres.
@@ -302,8 +295,8 @@ def sidestep(
       `[2]` the waypoint, or a position next to the blocking robot: on the shorter side with room,
       on the right if both are equal.
     """
-    keep = 2 * settings.robot_radius + _SIDESTEP
-    reach = arena.side / 2 - settings.robot_radius
+    keep = 2 * PLANNING_RADIUS + _SIDESTEP
+    reach = arena.side / 2 - PLANNING_RADIUS
     along = waypoint - position
     length = jnp.maximum(jnp.linalg.norm(along), 1e-6)
     along /= length
@@ -324,7 +317,7 @@ def sidestep(
             [cos * to_other + sin * across, cos * to_other - sin * across]
         )
         to_pois = jnp.linalg.norm(sides[:, None] - layout.position[None], axis=-1)
-        has_room = jnp.all(to_pois >= arena.poi_extent + settings.robot_radius, axis=-1)
+        has_room = jnp.all(to_pois >= arena.poi_extent + PLANNING_RADIUS, axis=-1)
         has_room &= jnp.max(jnp.abs(sides), axis=-1) <= reach
         detour = jnp.linalg.norm(sides - waypoint[None], axis=-1) + jnp.array([0.0, 0.05])
         best = jnp.argmin(jnp.where(has_room, detour, jnp.inf))
@@ -342,7 +335,7 @@ def _change(acceleration: float, seconds: float) -> float:
     return seconds * acceleration + 1e-6
 
 
-def _arcs(settings: NavigationConfig, turn_rate: Float[Array, ""], seconds: float) -> _Arcs:
+def _arcs(turn_rate: Float[Array, ""], seconds: float) -> _Arcs:
     """The arcs of the commands that the planner tries, at the turn rates within reach."""
     forward = np.linspace(0.0, amiro.MAX_SPEED, _NUM_SPEEDS - 1)
     speeds = np.concatenate([[-_BACKWARD_SPEED], forward]).astype(np.float32)
@@ -352,7 +345,7 @@ def _arcs(settings: NavigationConfig, turn_rate: Float[Array, ""], seconds: floa
     first = jnp.ceil((turn_rate - change - turns[0]) / spacing).astype(jnp.int32)
     first = jnp.clip(first, 0, _NUM_TURN_RATES - number)
 
-    times = settings.horizon * jnp.array(_SAMPLE_TIMES, jnp.float32)
+    times = _HORIZON * jnp.array(_SAMPLE_TIMES, jnp.float32)
     w = jnp.array(turns, jnp.float32)[:, None]
     heading = w * times[None]
     # At a speed of 1 m/s, sin(h) / w and (1 - cos(h)) / w, also where w is 0.

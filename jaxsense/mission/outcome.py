@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
+from jaxsense.config import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.dqn import rewards
 from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
@@ -91,7 +92,7 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
         "nll": -jnp.log(of_truth),
         "seen": is_seen,
         "observations_per_poi": jnp.sum(robots.looks) / config.arena.num_pois,
-        "time_s": state.steps * config.mission.control_period,
+        "time_s": state.steps * CONTROL_PERIOD,
         "collisions": state.contacts,
         "goals": jnp.sum(robots.goals),
         "goals_reached": jnp.sum(robots.reached),

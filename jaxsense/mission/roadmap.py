@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.config import MARGIN, NODES_PER_POI, PLANNING_RADIUS, VIEW_SIDES, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
 
+VIEW_DISTANCES = 0.5, 0.9
+"""Distances of viewpoints from a PoI, in metres, where it and its sensors allow them."""
 _LEEWAY = 0.035  # m, within which of a node the next one stays in view
 _MARGIN = 0.02  # m, extra distance of paths between nodes from PoIs
 _SLACK = 1e-3  # m that a path may cut into an obstacle, because nodes touch their obstacle's circle
@@ -86,14 +88,14 @@ def build(config: Config, layout: Layout) -> Roadmap:
       ValueError: if the layout is not that of one arena of `config`.
     """
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
-    arena, settings = config.arena, config.navigation
+    arena = config.arena
     radius = _radius(config)
     sides = 2 * jnp.pi * jnp.arange(float(NODES_PER_POI)) / NODES_PER_POI
     # So far out that the paths between neighbours do not cut the circle.
     ring = (radius + _LEEWAY) / math.cos(math.pi / NODES_PER_POI)
     around = ring * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     nodes = (layout.position[:, None] + around[None]).reshape(-1, 2)
-    reach = arena.side / 2 - settings.robot_radius
+    reach = arena.side / 2 - PLANNING_RADIUS
     to_pois = jnp.linalg.norm(nodes[:, None] - layout.position[None], axis=-1)
     is_usable = jnp.all(to_pois >= radius, axis=-1) & (jnp.max(jnp.abs(nodes), axis=-1) <= reach)
     goals, is_free = _viewpoints(config, layout)
@@ -189,7 +191,7 @@ def next_waypoint(
     first = jnp.concatenate(_first(config, layout, roadmap, position, goal))
     ends = jnp.concatenate([goal, roadmap.nodes])
     apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
-    is_taken = jnp.any(apart < 2 * config.navigation.robot_radius, axis=-1)
+    is_taken = jnp.any(apart < 2 * PLANNING_RADIUS, axis=-1)
     # Of two nodes on one path the farther one, or a robot that has reached a node would stay there.
     remaining = jnp.append(0.0, 1.001 * to_view)
     total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
@@ -214,14 +216,18 @@ def _first(
 
 def _radius(config: Config) -> float:
     """Minimum distance of paths between nodes from the centres of PoIs, in metres."""
-    return config.arena.poi_extent + config.navigation.robot_radius + _MARGIN
+    return config.arena.poi_extent + PLANNING_RADIUS + _MARGIN
 
 
 def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], Bool[Array, "N V"]]:
     """Positions around each PoI, and whether they are free and see it."""
     settings, num_pois = config.navigation, config.arena.num_pois
     sides = 2 * jnp.pi * jnp.arange(float(VIEW_SIDES)) / VIEW_SIDES
-    distances = jnp.array(settings.view_distances)
+    nearest = config.viewpoint.min_distance + config.mission.localisation.search[0]
+    nearest = jnp.maximum(config.arena.poi_extent + PLANNING_RADIUS, nearest)
+    near = jnp.maximum(VIEW_DISTANCES[0], nearest)
+    far = jnp.maximum(near, jnp.minimum(VIEW_DISTANCES[1], settings.view_range))
+    distances = jnp.stack([near, far])
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     positions = layout.position[:, None] + offsets[None]
@@ -229,7 +235,7 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], 
 
     def room(positions: jax.Array, poi: jax.Array) -> jax.Array:
         x, y = positions[:, 0], positions[:, 1]
-        return viewpoints.free_room(x, y, settings.margin, config.arena, layout, none, poi)
+        return viewpoints.free_room(x, y, MARGIN, config.arena, layout, none, poi)
 
     return positions, jax.vmap(room)(positions, jnp.arange(num_pois)) > 0
 

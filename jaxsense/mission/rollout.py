@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from jaxsense.config import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key
 from jaxsense.mission import act, decide
@@ -23,6 +24,8 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import localisation
+
+_MESSAGE_PERIODS = 10  # of control, after which a robot repeats its message
 
 
 def rollout(
@@ -122,7 +125,7 @@ def step(
     robots = states.robots
     is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
     steps, settings = states.steps + 1, mission.config.mission
-    is_late = steps * settings.control_period >= settings.time_limit
+    is_late = steps * CONTROL_PERIOD >= settings.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
     after = jax.vmap(lambda key, state: _repeat_messages(key, mission, state))(message_keys, after)
     keep = jax.vmap(jnp.where)
@@ -184,14 +187,11 @@ def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionStat
 
 def _repeat_messages(key: Key, mission: Mission, state: MissionState) -> MissionState:
     """Lets all robots that have not failed tell their looks again, once in a while."""
-    settings = mission.config.mission
     if state.memory is None:
         return state
-    periods = jnp.maximum(
-        jnp.round(settings.communication.period / settings.control_period), 1
-    ).astype(jnp.int32)
-    sends = (state.steps % periods == 0) & (state.robots.phase != FAILED)
-    heard = state.memory.after_messages(key, settings.communication, mission.time(state), sends)
+    sends = (state.steps % _MESSAGE_PERIODS == 0) & (state.robots.phase != FAILED)
+    settings = mission.config.mission.communication
+    heard = state.memory.after_messages(key, settings, mission.time(state), sends)
     return dataclasses.replace(state, memory=heard)
 
 

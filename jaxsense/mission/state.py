@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import CONTROL_PERIOD, Config, ConfigError
 from jaxsense.config.frozen import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
@@ -20,6 +20,8 @@ from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, World
 
+ATTEMPTS = 3
+"""Failed looks or goals after which a robot gives up a PoI, or retries where it was stuck."""
 RECENT_LOOKS = 32
 """Looks by a sensor at a PoI whose places are remembered."""
 
@@ -242,7 +244,7 @@ class Mission:
 
     def time(self, state: MissionState) -> Float[Array, "..."]:
         """Seconds since the start."""
-        return state.steps * self.config.mission.control_period
+        return state.steps * CONTROL_PERIOD
 
 
 @checks.typed

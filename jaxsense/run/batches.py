@@ -6,13 +6,15 @@ limits of PoIs, robots and viewpoints bound the state of one, and `batch_of` how
 
 import math
 
-from jaxsense.config import NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.config import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES, Config
 from jaxsense.core import checks
 from jaxsense.mission.memory import MOST_LOOKS
+from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.run import devices
 from jaxsense.run.devices import ALONE, Workers
 
-_CHUNK_TIME = 2.5  # s
+CHUNK = math.ceil(2.5 / CONTROL_PERIOD)
+"""Control periods between two reports."""
 # Missions side by side on each thread of a CPU or on each accelerator.
 _LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
 _MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
@@ -21,11 +23,6 @@ _MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
 # this times T at its minimum.
 _AS_LONG_AS_NONE = 8192
 _MANY_POIS = 2**14  # of all missions; on a CPU, one takes some 3 ms of a core
-
-
-def chunk_of(config: Config) -> int:
-    """Control periods between two reports. Traced settings must not enter: it is a size."""
-    return math.ceil(_CHUNK_TIME / config.mission.control_period)
 
 
 def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
@@ -57,7 +54,7 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
 def _bytes_of_state(config: Config) -> int:
     """Bytes of a mission's state, roughly: of its roadmap, its robots' maps and some more."""
     robots, num_classes = len(config.carried), len(config.arena.classes)
-    views = config.arena.num_pois * VIEW_SIDES * len(config.navigation.view_distances)
+    views = config.arena.num_pois * VIEW_SIDES * len(VIEW_DISTANCES)
     nodes = config.arena.num_pois * NODES_PER_POI
     numbers = nodes * (nodes + robots)
     if config.mission.communication.own_maps:

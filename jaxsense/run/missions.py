@@ -25,7 +25,7 @@ from jaxsense.mission import (
 )
 from jaxsense.models import Models, init
 from jaxsense.run import devices, films
-from jaxsense.run.batches import chunk_of
+from jaxsense.run.batches import CHUNK
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.films import Films, Recording
@@ -134,7 +134,6 @@ class Player:
         # Devices of a mesh take each call together; threads take their own.
         together = Workers(mesh=workers.mesh)
         recorded = min(films.AT_A_TIME, self._share)
-        chunk = chunk_of(config)
         self._lock = threading.Lock()
 
         def with_numbers(config: Config) -> Mission:
@@ -170,7 +169,7 @@ class Player:
             slots = _refilled(slots, reserve, taken)
             keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(slots.episode)
             keys = jax.vmap(jax.random.fold_in)(keys, slots.chunks)
-            states, records = rollout_batch(keys, scenario, models, slots.states, chunk, recorded)
+            states, records = rollout_batch(keys, scenario, models, slots.states, CHUNK, recorded)
             slots = _Slots(slots.episode, slots.chunks + 1, states)
             first = jax.tree.map(lambda x: x[:recorded], states)
             return slots, _found(scenario, models, slots), Recording(first, records)

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 import jax
 import numpy as np
 
-from jaxsense.config import Config
+from jaxsense.config import CONTROL_PERIOD, Config
 from jaxsense.core.types import Belief, Fusion
 from jaxsense.mission import MissionState, Record
 from jaxsense.show.colours import modality_colour
@@ -55,7 +55,7 @@ def draw(
       The content of the file.
     """
     seconds = duration_of(config, end)
-    last = round(max(seconds, lasts) / config.mission.control_period)
+    last = round(max(seconds, lasts) / CONTROL_PERIOD)
     record = _frames(config, records, fusion.prior, last)
     shown = np.asarray(record.time) / _SPEED
     duration = float(shown[-1]) + _PAUSE
@@ -92,7 +92,7 @@ def draw(
 
 def duration_of(config: Config, end: MissionState) -> float:
     """Seconds from the beginning of a mission until its end."""
-    return config.mission.control_period * int(end.steps)
+    return CONTROL_PERIOD * int(end.steps)
 
 
 @jax.jit
@@ -105,7 +105,7 @@ def _frames(config: Config, records: Record, prior: Belief, last: int) -> Record
     """The frames from just before a mission until shortly after the `last` control period."""
     rows = np.minimum(np.arange(-1, last + _AFTER).clip(0), len(records.time) - 1)
     record: Record = jax.tree.map(lambda x: np.array(np.asarray(x)[rows]), records)
-    record.time[:] = config.mission.control_period * np.arange(len(rows))
+    record.time[:] = CONTROL_PERIOD * np.arange(len(rows))
     record.seen[0], record.scanned[0], record.detected[0] = False, False, False
     record.phase[0], record.target[0] = 0, config.arena.num_pois
     record.belief.mean[0], record.belief.std[0] = prior.mean, prior.std

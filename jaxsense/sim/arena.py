@@ -17,7 +17,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import TIMESTEP, ArenaConfig, Shape
+from jaxsense.config import POI_HEIGHT, TIMESTEP, ArenaConfig, Shape
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro
@@ -164,7 +164,7 @@ def _walls(config: ArenaConfig) -> str:
 def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     """Writes the MJCF of one solid of one PoI."""
     u, v = (share * config.poi_radius for share in shape.half_sides)
-    half_height = config.poi_height / 2
+    half_height = POI_HEIGHT / 2
     size = f"{u} {half_height}" if shape.is_round else f"{u} {v} {half_height}"
     solid = f'<geom name="{name}" type="{shape.primitive}" size="{size}"'
     collides = 'class="obstacle"/>'
@@ -259,7 +259,7 @@ def put(arena: Arena, layout: Layout, poses: Float[Array, "R 3"]) -> mjx.Data:
     chex.assert_shape(poses, (arena.num_robots, 3))
     chex.assert_shape(layout.position, (arena.config.num_pois, 2))
     shown = layout.shape[:, None] == jnp.arange(len(arena.config.shapes))[None]
-    height = jnp.where(shown, arena.config.poi_height / 2, _STORE)
+    height = jnp.where(shown, POI_HEIGHT / 2, _STORE)
     position = jnp.concatenate(
         [jnp.broadcast_to(layout.position[:, None], (*height.shape, 2)), height[..., None]], axis=-1
     )

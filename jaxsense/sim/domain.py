@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import Config
+from jaxsense.config import MAX_BEARING, Config
 from jaxsense.core.types import pytree
 from jaxsense.sim import windows
 from jaxsense.sim.sensors import Sensor
@@ -49,7 +49,7 @@ def make_domain(config: Config, sensor: Sensor) -> Domain:
     """Domain of the detector that a training with these settings gives a sensor."""
     view, errors = config.viewpoint, config.mission.localisation
     deviations = _DEVIATIONS * errors.in_training
-    off = view.max_bearing + view.bearing_error + deviations * errors.heading_error
+    off = MAX_BEARING + view.bearing_error + deviations * errors.error[1]
     drawn, either = jnp.radians(off), jnp.array([-1.0, 1.0])
     angles, number = sensor.angles, len(sensor.angles)
     # Evenly spaced rays lie alike around PoIs at all bearings, unless the window meets an end.
@@ -59,7 +59,7 @@ def make_domain(config: Config, sensor: Sensor) -> Domain:
     bearings = [jnp.min(inner, initial=-drawn), jnp.max(inner, initial=drawn)]
     distances = [jnp.asarray(view.min_distance), jnp.asarray(view.max_distance)]
     return Domain(
-        distance=jnp.stack(distances) + deviations * errors.position_error * either,
+        distance=jnp.stack(distances) + deviations * errors.error[0] * either,
         bearing=jnp.clip(jnp.stack(bearings), angles.min(), angles.max()),
         step=jnp.array(sensor.steps),
         range=jnp.full(2, jnp.nan_to_num(sensor.window_limit)),

@@ -57,17 +57,12 @@ class Light:
     conditions: Conditions | None = None
     point: jax.Array | None = None
 
-    def changes(
-        self, distance: Float[Array, ""] | float, time: Float[Array, ""] | float
-    ) -> Float[Array, "8"]:
-        """Values of the conditions where and when a sensor looks.
+    def changes(self, distance: float = 0.5, time: float = 60.0) -> Float[Array, "8"]:
+        """Values of the conditions where and when a sensor looks, standard normal over scenes.
 
         Args:
           distance: over which they change, in metres.
           time: over which they change, in seconds.
-
-        Returns:
-          Values that are standard normal over scenes.
 
         Raises:
           ValueError: if the conditions have not been drawn, or the point has not been set.
@@ -79,7 +74,7 @@ class Light:
             )
         if self.point is None:
             raise ValueError("light.point = None: must be set, as sim.scan does")
-        return self.conditions.at(self.point / jnp.stack([distance, distance, time]))
+        return self.conditions.at(self.point / jnp.array([distance, distance, time]))
 
 
 def random_conditions(key: Key) -> Conditions:

@@ -15,7 +15,7 @@ from jaxsense.core.types import Key
 
 def draw(key: Key, config: LocalisationConfig, num_robots: int) -> Float[Array, "R 3"]:
     """Error of each robot's pose at the start of a mission: believed minus true [m, m, rad]."""
-    scale = _scale(config.position_error, config.heading_error)
+    scale = _scale(*config.error)
     return scale * jax.random.normal(key, (num_robots, 3))
 
 
@@ -26,7 +26,7 @@ def drift(
     driven: Float[Array, " R"],
 ) -> Float[Array, "R 3"]:
     """Errors after the robots have driven on for `driven` metres."""
-    scale = _scale(config.position_drift, config.heading_drift)
+    scale = _scale(*config.drift)
     return error + scale * jnp.sqrt(driven)[:, None] * jax.random.normal(key, error.shape)
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsense.config import SearchConfig
+from jaxsense.config import Search
 from jaxsense.core.types import pytree
 from jaxsense.sim import windows
 from jaxsense.sim.sensors import Sensor
@@ -33,7 +33,7 @@ class Candidates:
     log_prior: Float[Array, "J K"]
 
 
-def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
+def widened(sensor: Sensor, search: Search) -> Sensor:
     """The sensor with a window that contains those of a search; without one, the sensor itself.
 
     It reaches no farther than the scan, and as far as errors explain at 0.3 m or farther away.
@@ -49,7 +49,7 @@ def widened(sensor: Sensor, search: SearchConfig) -> Sensor:
 
 def candidates(
     sensor: Sensor,
-    search: SearchConfig,
+    search: Search,
     window: Float[Array, " F"],
     bearing: Float[Array, ""],
     distance: Float[Array, ""],

@@ -17,7 +17,14 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from jaxsense.config import LIDAR_HEIGHT, CameraConfig, Config, ConfigError, LidarConfig
+from jaxsense.config import (
+    LIDAR_HEIGHT,
+    POI_HEIGHT,
+    CameraConfig,
+    Config,
+    ConfigError,
+    LidarConfig,
+)
 from jaxsense.config.checks import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
@@ -222,7 +229,7 @@ class Camera(Sensor):
         facing = normal_x * light.direction[0] + normal_y * light.direction[1]
         direct, gain = light.diffuse * jnp.maximum(facing, 0.0), None
         if self.reads_conditions:
-            values = light.changes(self.config.light_distance, self.config.light_time)
+            values = light.changes()
             place = jnp.asarray(hits.ray) / self.config.num_pixels
             gain, is_lit = lighting(values, place, self.config)
             direct = direct * is_lit
@@ -254,7 +261,6 @@ def lidar(config: LidarConfig) -> Lidar:
         height=LIDAR_HEIGHT,
         rays=Fan(config.num_beams, config.field_of_view),
         window=config.window,
-        stride=config.stride,
         measures_distance=True,
         window_limit=config.window_range,
         blind=config.max_range,
@@ -304,8 +310,8 @@ def _own(name: str, config: Config) -> Sensor:
     if not isinstance(sensor, Sensor):
         kind = type(sensor).__name__
         raise ConfigError(f"{field}.make", path, f"must return a jaxsense.sim.Sensor, not {kind}")
-    if not 0 < sensor.height < config.arena.poi_height:
-        reason = f"must be above 0 and below arena.poi_height = {config.arena.poi_height} m"
+    if not 0 < sensor.height < POI_HEIGHT:
+        reason = f"must be above 0 and below {POI_HEIGHT} m, the height of PoIs"
         raise ConfigError(f"{field}: height", sensor.height, reason)
     most = (len(sensor.angles) - 1) // sensor.stride + 1
     if not 1 <= sensor.window <= most:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.config import CLEARANCE, MAX_BEARING, ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Index, Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
@@ -38,7 +38,7 @@ def random_viewpoint(
     side = jnp.pi * (2 * draws[NUM_CANDIDATES:-2] - 1)
     target = layout.position[poi]
     position = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
-    room = free_room(position[0], position[1], config.clearance, arena, layout, others, poi)
+    room = free_room(position[0], position[1], CLEARANCE, arena, layout, others, poi)
     first_free = jnp.argmax(room > 0)
     chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
 
@@ -66,7 +66,7 @@ def moved_viewpoint(
     x = position[0] + distance * jnp.cos(direction)
     y = position[1] + distance * jnp.sin(direction)
     to_poi = jnp.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-    is_free = free_room(x, y, config.clearance, arena, layout, others, poi) > 0
+    is_free = free_room(x, y, CLEARANCE, arena, layout, others, poi) > 0
     is_free &= (to_poi >= config.min_distance) & (to_poi <= config.max_distance)
     chosen = jnp.argmax(is_free)
     stand = jnp.where(jnp.any(is_free), jnp.stack([x[chosen], y[chosen]]), position)
@@ -79,7 +79,7 @@ def _bearings(
     heading: jax.Array, error: jax.Array, config: ViewpointConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Bearing of a PoI, and the one that the robot believes, from uniform draws."""
-    bearing = jnp.radians(config.max_bearing) * (2 * heading - 1)
+    bearing = jnp.radians(MAX_BEARING) * (2 * heading - 1)
     return bearing, bearing + jnp.radians(config.bearing_error) * (2 * error - 1)
 
 

@@ -81,7 +81,7 @@ class Environment(abc.ABC):
     @property
     def max_steps(self) -> int:
         """Actions after which an episode is truncated."""
-        return self.mdp.config.max_steps
+        return int(self.mdp.max_steps)
 
     @property
     @abc.abstractmethod

@@ -244,6 +244,8 @@ def _made(
         "modalities": config.modalities,
     }
     if config.dqn.task == "team":
+        # A task is a whole mission.
+        parts_of_all["mdp"] = dataclasses.replace(parts_of_all["mdp"], partly_seen=0.0)
         return TeamTask(**parts_of_all, robots=jnp.array(config.modality_of_robot, jnp.int32))
     return MapTask(**parts_of_all, modality=config.modalities.index(agent))
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import Config, TeamConfig
+from jaxsense.config import Config
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
@@ -220,8 +220,8 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
         settings = config.team.tours
         try_key, draw_key = jax.random.split(key)
         mdp = cast("TeamMdp", mdp_of(config, fusion, Bank(detections.bank)))
-        followed = _Auction(config.team, fusion, look_values)
-        found = tours.try_choices(try_key, mdp, followed, settings, number)
+        followed = _Auction(mdp, fusion, look_values)
+        found = tours.try_choices(try_key, mdp, followed, number)
         trials = tours.write(trials, found, fit.step // size * number)
         problem = tours.Fitting(settings, trials, network, config.jmvae.latent_size)
         fit, losses = supervised.fit(draw_key, fit, problem, size)
@@ -238,7 +238,7 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
 class _Auction:
     """The policy that robots follow in trials: an auction of gains minus the price of travel."""
 
-    config: TeamConfig
+    mdp: TeamMdp
     fusion: Fusion
     look_values: tuple[LookValues, ...]
 
@@ -248,6 +248,6 @@ class _Auction:
 
     def values(self, read: Float[Array, "N M"], state: TeamState) -> Float[Array, " A"]:
         """`[N + 1]` values of actions."""
-        times = team_mdp.travel_times(self.config.travel, state.team)
-        worth = read.T[state.team.modality] - self.config.second_cost * times
+        times = team_mdp.travel_times(self.mdp.travel, state.team)
+        worth = read.T[state.team.modality] - self.mdp.config.second_cost * times
         return rules.auction(worth, times, state.team, state.agent)

@@ -49,7 +49,7 @@ def _filter_stage(config: Config) -> Stage:
     def untrained(
         key: Key, config: Config, *, classes: Belief, detections: Detections
     ) -> tuple[Filter, Params]:
-        found = filter.init(key, make_jmvae(config), classes, make_prior(config), config.filter)
+        found = filter.init(key, make_jmvae(config), classes, make_prior(config))
         return found, found.networks
 
     def problem(

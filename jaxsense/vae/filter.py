@@ -26,6 +26,7 @@ from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.readout import Readout
 
 _MIN_FEATURE = 1e-6
+_LOOKS, _BATCH = 6, 256  # of each history, histories of each step
 
 Drawn = tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]
 """Classes `[steps, B]`, sensors `[steps, T, B]`, and for each modality `[steps, D_m, T, B]`."""
@@ -116,12 +117,14 @@ class Filter:
         return jnp.argmax(self.class_probabilities(belief))
 
 
-def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterConfig) -> Filter:
+def init(
+    key: Key, model: Jmvae, classes: Belief, prior: Belief, hidden: tuple[int, ...] = (32,)
+) -> Filter:
     """Untrained filter, which looks do not update; see `Filter`."""
     checks.require_shape("classes.mean", classes.mean, (None, model.latent_size))
     checks.require_shape("prior.mean", prior.mean, (model.latent_size,))
     read = readout.make(classes, readout.directions(model.feature_sizes))
-    network = MLP(config.hidden, read.of_classes.shape[1])
+    network = MLP(hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))
     of_each = zip(keys, model.modalities, model.feature_sizes, strict=True)
     # From zero: probabilities that random log-likelihoods have saturated would hardly learn.
@@ -129,7 +132,7 @@ def init(key: Key, model: Jmvae, classes: Belief, prior: Belief, config: FilterC
         name: networks.scale_last(network, networks.init(k, network, size), 0.0)
         for k, name, size in of_each
     }
-    return Filter(silent, classes, prior, read, model, config.hidden)
+    return Filter(silent, classes, prior, read, model, hidden)
 
 
 @pytree
@@ -142,9 +145,9 @@ class Fitting:
 
     def draw(self, key: Key, number: int) -> Drawn:
         """Histories of looks, see `Problem.draw`."""
-        bank, shape = self.bank, (number, self.config.looks, self.config.batch)
+        bank, shape = self.bank, (number, _LOOKS, _BATCH)
         class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
-        classes = jax.random.randint(class_key, (number, self.config.batch), 0, len(bank[0]))
+        classes = jax.random.randint(class_key, (number, _BATCH), 0, len(bank[0]))
         sensors = jax.random.randint(sensor_key, shape, 0, len(bank))
         looks = tuple(
             jnp.moveaxis(x[classes[:, None], jax.random.randint(k, shape, 0, x.shape[1])], -1, 1)

@@ -28,7 +28,7 @@ from jaxsense.vae.readout import Readout
 
 _EMBEDDING = 64  # numbers that a network finds in a look
 _FIRST_ALPHA = 0.1  # weight of divergences before alpha sets in, with a fixed joint posterior
-_ALPHA_RAMP = 0.2  # of the training
+_ALPHA_START, _ALPHA_RAMP = 0.4, 0.2  # of the training
 _LOG_VARIANCES = -10.0, 6.0
 _TRIES, _MOVES = 16, 30  # of k-means
 
@@ -185,7 +185,7 @@ class Fitting:
         """Mean of the `losses` of a batch; the step determines alpha and beta."""
         rows, noise = drawn
         share = step / self.config.steps
-        has_begun = jnp.clip((share - self.config.alpha_start) / _ALPHA_RAMP, 0.0, 1.0)
+        has_begun = jnp.clip((share - _ALPHA_START) / _ALPHA_RAMP, 0.0, 1.0)
         of_each = losses(
             noise,
             params,

@@ -12,7 +12,6 @@ from untrained import untrained
 
 import jaxsense
 from jaxsense import Belief, Transition, dqn, mission, recorded, sim, tasks, vae
-from jaxsense.config import FilterConfig
 from jaxsense.dqn import replay
 from jaxsense.interfaces import common
 from jaxsense.mission import roadmap
@@ -40,7 +39,7 @@ class World:
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
         classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
         prior = vae.prior(self.model, 20.0)
-        self.filter = filter.init(self.key, self.model, classes, prior, FilterConfig(hidden=(1,)))
+        self.filter = filter.init(self.key, self.model, classes, prior, (1,))
         self.in_place = self.models.fusion
         self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
         self.mdp = jaxsense.make_mdp(SMOKE, self.models, jaxsense.Bank(self.bank))

@@ -167,9 +167,9 @@ def test_a_traced_setting_does_not_switch_off_the_checks_of_others():
 
     def bearing(distance):
         viewpoint = dataclasses.replace(config.viewpoint, min_distance=distance)
-        return dataclasses.replace(viewpoint, max_bearing=31.0).max_bearing
+        return dataclasses.replace(viewpoint, bearing_error=31.0).bearing_error
 
-    with pytest.raises(ValueError, match=r"viewpoint.max_bearing = 31.0: must be from 0 to 30"):
+    with pytest.raises(ValueError, match=r"viewpoint.bearing_error = 31.0: must be from 0 to 10"):
         jax.jit(bearing)(0.4)
 
 
@@ -183,5 +183,5 @@ def test_an_array_is_checked_like_a_number(value, message):
 
 
 def test_a_relation_with_an_array_is_checked():
-    with pytest.raises(ValueError, match="epsilon_min"):
-        dataclasses.replace(Config().dqn, epsilon_min=jnp.float32(0.9), epsilon_start=0.5)
+    with pytest.raises(ValueError, match="max_distance"):
+        dataclasses.replace(Config().viewpoint, max_distance=jnp.float32(0.2))

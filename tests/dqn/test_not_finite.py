@@ -83,12 +83,10 @@ def test_rewards_that_are_not_numbers_choose_no_action():
 CONFIG = DqnConfig(
     hidden=(4,),
     num_envs=4,
-    epochs=4,
-    chunk=2,
+    epochs=2,
     updates=1,
     batch=4,
     replay_capacity=4000,
-    num_starts=4,
     epsilon_min=1.0,
 )
 

@@ -10,31 +10,28 @@ from toys import (
     ONCE_Q,
     ONCE_SEEN,
     PLACES,
-    SENSORS,
-    TRAVEL,
     Fixed,
     classes_mdp,
     known_of,
     paying_once_mdp,
     policy,
+    team_mdp_of,
 )
 
 from jaxsense.config import PRESETS, DqnConfig, TeamConfig
 from jaxsense.dqn import losses, map_mdp, team_mdp, training
 from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.models import make_agent
 
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 SMALL = DqnConfig(
-    task="team", observe="bank", hidden=(8,), num_envs=8, epochs=12, chunk=12, updates=1, batch=8,
-    replay_capacity=64, num_starts=16, discount=0.5,
+    task="team", observe="bank", hidden=(8,), num_envs=8, epochs=12, updates=1, batch=8,
+    replay_capacity=64, discount=0.5,
 )  # fmt: skip
 
 
 def team_of(mapped, poses, places, **config):
-    given = {"travel": TRAVEL, "robots_each": 1, "alone": 0.0, "partly_seen": 0.0, **config}
-    return TeamMdp(TeamConfig(**given), mapped, Fixed(places, poses), SENSORS)
+    return team_mdp_of(mapped, Fixed(places, poses), **{"alone": 0.0, "partly_seen": 0.0, **config})
 
 
 def learning_in(mdp, config=SMALL):
@@ -195,9 +192,9 @@ ALONE = team_of(
     max_steps=3,
 )  # fmt: skip
 PROBE = replace(
-    SMALL, hidden=(16,), num_envs=32, epochs=600, chunk=600, updates=2, batch=64,
-    replay_capacity=4096, learning_rate=1e-2, final_learning_rate=1e-4, epsilon_min=0.5,
-    target_period=20, num_starts=256,
+    SMALL, hidden=(16,), num_envs=32, epochs=600, updates=2, batch=64,
+    replay_capacity=4096, learning_rate=1e-2, epsilon_min=0.5,
+    target_period=20,
 )  # fmt: skip
 
 

@@ -7,11 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import PLACES, SENSORS, TRAVEL, Fixed, classes_mdp, noisy_mdp
+from toys import PLACES, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
-from jaxsense.config import TeamConfig
 from jaxsense.dqn import map_mdp, team_mdp
-from jaxsense.dqn.team_mdp import Team, TeamMdp, TeamState
+from jaxsense.dqn.team_mdp import Team, TeamState
 
 NOP, CAMERA, LIDAR = 3, 0, 1
 FIRST, SECOND = 0.2 - 1 / np.sqrt(40), 0.8  # gains of looks, see `toys.classes_mdp`
@@ -20,8 +19,8 @@ FIRST, SECOND = 0.2 - 1 / np.sqrt(40), 0.8  # gains of looks, see `toys.classes_
 def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
     mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
     poses = jnp.arange(3.0 * robots_each * mapped.num_modalities).reshape(-1, 3)
-    given = {"travel": TRAVEL, "num_pois": (1, 3), "robots_each": robots_each, **config}
-    return TeamMdp(TeamConfig(**given), mapped, Fixed(places, poses), SENSORS)
+    given = {"num_pois": (1, 3), "robots_each": robots_each, **config}
+    return team_mdp_of(mapped, Fixed(places, poses), **given)
 
 
 MDP = make_mdp()
@@ -64,14 +63,12 @@ def play(state, *actions):
 
 
 @jax.jit
-def reset_all(keys, config):
-    mdp = replace(make_mdp(robots_each=2), config=config)
+def reset_all(keys, mdp):
     return jax.vmap(lambda key: team_mdp.reset(key, mdp))(keys)
 
 
-def resets(**config):
-    config = TeamConfig(travel=TRAVEL, robots_each=2, **{"num_pois": (1, 3), **config})
-    return reset_all(jax.random.split(jax.random.key(3), 600), config)
+def resets(**given):
+    return reset_all(jax.random.split(jax.random.key(3), 600), make_mdp(robots_each=2, **given))
 
 
 def test_teams_start_with_every_number_of_pois_and_of_robots():
@@ -249,7 +246,7 @@ def test_places_of_another_size_are_named():
     with pytest.raises(ValueError, match="positions"):
         team_mdp.reset(jax.random.key(0), make_mdp(places=PLACES[:2]))
     with pytest.raises(ValueError, match="poses"):
-        team_mdp.reset(jax.random.key(0), replace(MDP, config=TeamConfig(robots_each=2)))
+        team_mdp.reset(jax.random.key(0), replace(MDP, robots_each=2))
 
 
 def test_an_episode_of_a_given_team_has_these_robots_and_no_other():

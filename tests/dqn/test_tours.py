@@ -8,25 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import SENSORS, Fixed, classes_mdp
+from toys import Fixed, classes_mdp, team_mdp_of
 
-from jaxsense.config import PRESETS, TeamConfig, ToursConfig, TravelConfig
+from jaxsense.config import PRESETS, TeamConfig, ToursConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import team_mdp, tours
 from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.dqn.team_mdp import Team, TeamMdp
+from jaxsense.dqn.team_mdp import Team
 from jaxsense.dqn.tours import Trials
+from jaxsense.dqn.travel import Travel
 from jaxsense.models import init
 
-TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+TRAVEL = Travel(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 # In a row, 1.9 and 3.9 m from two robots at the origin; the third is not present.
 PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
 # 1 m to the first and 2 m on to the second, with a look at each.
 IN_ORDER = (5 + 1) + (10 + 1)
 # 3 m to the second, a half turn and .2 m back to the first.
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
-AGENT = TeamAgent(TeamConfig(travel=TRAVEL), 0.5, -1.0, 2, 2, (8,), True)
+AGENT = TeamAgent(TeamConfig(), 0.5, -1.0, 2, 2, (8,), True)
 NETWORK = AGENT.network
 CLASSES = Belief(np.float32([[1.0, 0.0], [-1.0, 0.5]]), np.full((2, 2), 0.2, np.float32))
 AT_ORIGIN = {
@@ -45,9 +46,9 @@ AT_ORIGIN = {
 
 def make_mdp(present=2, max_steps=300):
     mapped = classes_mdp(partly_seen_starts=False)
-    given = {"travel": TRAVEL, "num_pois": (present, present), "robots_each": 1, "alone": 1.0}
-    settings = TeamConfig(**given, partly_seen=0.0, max_steps=max_steps)
-    return TeamMdp(settings, mapped, Fixed(PLACES, jnp.zeros((2, 3))), SENSORS)
+    given = {"num_pois": (present, present), "alone": 1.0, "partly_seen": 0.0, "travel": TRAVEL}
+    places = Fixed(PLACES, jnp.zeros((2, 3)))
+    return team_mdp_of(mapped, places, max_steps=max_steps, **given)
 
 
 def trials_of(present=2, max_steps=300, walk=0, bonus=0.0):
@@ -76,8 +77,11 @@ class InOrder:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _trials(present, max_steps, walk, bonus):
-    config, mdp = ToursConfig(tries=2, walk=walk), make_mdp(present, max_steps)
-    return tours.try_choices(jax.random.key(0), mdp, InOrder(bonus), config, 64)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tours, "_TRIES", 2)
+        patch.setattr(tours, "_WALK", walk)
+        mdp = make_mdp(present, max_steps)
+        return tours.try_choices(jax.random.key(0), mdp, InOrder(bonus), 64)
 
 
 def fitting(trials, **config):
@@ -148,14 +152,14 @@ def test_columns_are_written_and_only_those_with_a_trial_drawn():
     found = tours.write(room, one, jnp.int32(3))
     np.testing.assert_array_equal(found.seconds.sum(axis=0), [0, 0, 0, 3, 3])
     np.testing.assert_array_equal(found.observation.sum(axis=0), [0, 0, 0, 6, 6])
-    drawn = fitting(found, batch=5).draw(jax.random.key(0), 8)
+    drawn = fitting(found, states=5).draw(jax.random.key(0), 8)
     assert drawn.shape == (8, 5)
     assert set(np.asarray(drawn).ravel().tolist()) == {3, 4}
 
 
 def test_training_finds_the_shorter_tour():
     trials = trials_of()
-    problem = fitting(trials, learning_rate=1e-2, steps=100, batch=64)
+    problem = fitting(trials, steps=400)
     params = networks.init(jax.random.key(1), NETWORK, NETWORK.features * 3)
     state = supervised.start(params, problem.config)
     fit = jax.jit(lambda state: supervised.fit(jax.random.key(2), state, problem, 100))
@@ -241,7 +245,7 @@ def decided(monkeypatch, after, cost):
 
     replace_q(monkeypatch, q)
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
-    agent = replace(AGENT, config=TeamConfig(travel=TRAVEL, second_cost=cost))
+    agent = replace(AGENT, config=TeamConfig(second_cost=cost))
     return jax.jit(lambda: agent.decide({}, ({},), classes=CLASSES, **AT_ORIGIN))()
 
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toys import TRAVEL
 
-from jaxsense.config import TravelConfig
 from jaxsense.dqn import travel
+from jaxsense.dqn.travel import Travel
 
 seconds_of_ways = jax.jit(travel.travel_seconds)
 move = jax.jit(travel.move)
@@ -42,7 +42,7 @@ def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
 
 def test_every_number_of_the_model_counts():
     pose, places = jnp.zeros(3), jnp.array([[0.0, 2.0]])
-    model = TravelConfig(speed=0.4, turn_rate=2.0, view_distance=0.4, look_seconds=3.0)
+    model = Travel(speed=0.4, turn_rate=2.0, view_distance=0.4, look_seconds=3.0)
     expected = math.pi / 2 / 2 + (2 - 0.4) / 0.4 + 3
     np.testing.assert_allclose(seconds_of_ways(model, pose, places)[0], expected, rtol=1e-5)
 

@@ -7,14 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxsense.config import MdpConfig, TravelConfig
+from jaxsense.config import MdpConfig, TeamConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import policies, rewards, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
+from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.travel import Travel
 
 SENSORS = ("camera", "lidar")
-TRAVEL = TravelConfig(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
+TRAVEL = Travel(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
 # From the origin 1.0, 2.0 and 3.0 m to drive: 5, 10 and 15 s.
 PLACES = jnp.array([[1.9, 0.0], [0.0, 2.9], [-3.9, 0.0]])
 
@@ -129,6 +131,13 @@ def classes_mdp(num_pois=3, num_modalities=2, **config):
     given = {"min_increase": 0.01, "partly_seen_starts": True, **config}
     prior = Belief(jnp.zeros(2), jnp.full(2, jnp.sqrt(20.0)))
     return make_mdp(Certain(num_modalities), Counting(prior, 3), num_pois, **given)
+
+
+def team_mdp_of(mapped, places, travel=TRAVEL, robots_each=1, **given):
+    """A team's MDP; what is given are fields of it or of its settings."""
+    names = {name: given.pop(name) for name in ("num_pois", "second_cost") if name in given}
+    config = TeamConfig(**names)
+    return TeamMdp(config, mapped, places, SENSORS, travel, robots_each=robots_each, **given)
 
 
 def noisy_mdp(num_pois=3, max_steps=20):

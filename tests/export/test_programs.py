@@ -14,10 +14,10 @@ from exporting import CONFIG, drawn
 
 import jaxsense
 from jaxsense import export
-from jaxsense.config import PRESETS, LocalisationConfig, SearchConfig
+from jaxsense.config import PRESETS, LocalisationConfig, Search
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn import observation, team_mdp
+from jaxsense.dqn import Travel, observation, team_mdp
 from jaxsense.interfaces import robot
 from jaxsense.models import make_jmvae
 from jaxsense.run.version import __version__
@@ -26,6 +26,7 @@ from jaxsense.tasks.pretrained import PRETRAINED
 from jaxsense.vae import detectors, jmvae, readout
 
 BATCH = 12
+TRAVEL = Travel(CONFIG.team.travel.view_distance)
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
 
 
@@ -106,7 +107,7 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, loaded):
     assert CONFIG.mission.auctions
 
     apply = jax.jit(lambda params, belief: network.apply(params, observation(belief)))
-    seconds = jax.jit(lambda pose, place: team_mdp.travel_seconds(CONFIG.team.travel, pose, place))
+    seconds = jax.jit(lambda pose, place: team_mdp.travel_seconds(TRAVEL, pose, place))
     means, stds = np.asarray(classes.mean), np.asarray(classes.std)
 
     def values_of(mean, std, present, m):
@@ -128,7 +129,7 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, loaded):
             only = present & (np.arange(SIZES["pois"]) == poi)
             alone = values_of(mean, std, only, modality[r])
             apart = np.linalg.norm(poses[r, :2] - looked_from[poi, modality[r]], axis=-1)
-            way = models.novelty.to_go(apart, modality[r]) / CONFIG.team.travel.speed
+            way = models.novelty.to_go(apart, modality[r]) / TRAVEL.speed
             there = seconds(poses[r], positions[poi][None])
             if only.any() and alone[poi] > alone[-1]:
                 bids[r, poi] = float(there[0] + way)
@@ -202,17 +203,14 @@ def test_contents_describe_what_is_there(models, file, loaded):
     assert (limits["min_distance"], limits["max_distance"]) == (0.3, 1.2)
     assert limits["max_bearing"] == pytest.approx(np.radians(20), abs=1e-6)
     assert contents["versions"] == {"jaxsense": __version__}
-    for variance in (20.0, 5.0):
-        mdp = dataclasses.replace(CONFIG.mdp, unseen_variance=variance)
-        config = dataclasses.replace(CONFIG, mdp=mdp)
-        unseen = export._description(config, jaxsense.init(jax.random.key(0), config))["unseen"]
-        assert unseen == {"mean": [0.0, 0.0], "std": pytest.approx([variance**0.5] * 2)}
-        json.dumps(unseen)
+    unseen = export._description(CONFIG, jaxsense.init(jax.random.key(0), CONFIG))["unseen"]
+    assert unseen == {"mean": [0.0, 0.0], "std": pytest.approx([20.0**0.5] * 2)}
+    json.dumps(unseen)
 
 
 @pytest.mark.slow
 def test_a_robot_searches_its_scans_as_missions_do(models):
-    errors = SearchConfig(position=0.06, heading=3.0)
+    errors = Search(position=0.06, heading=3.0)
     mission = dataclasses.replace(CONFIG.mission, localisation=LocalisationConfig(search=errors))
     found = export.functions(dataclasses.replace(CONFIG, mission=mission))
     # Untrained detectors have no scale, and are never unsure.

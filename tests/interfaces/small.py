@@ -19,12 +19,12 @@ from jaxsense.vae import jmvae, readout
 CONFIG = dataclasses.replace(
     PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(32, 32), restarts=1, steps=3000, batch=64)
 )
-# A price of time that is a sum of powers of 2, and the lonely episodes that no interface may have.
+# A price of time that is a sum of powers of 2.
 TEAM = dataclasses.replace(
     CONFIG,
     dqn=dataclasses.replace(CONFIG.dqn, task="team", observe="bank"),
     robots=("camera", "camera", "lidar"),
-    team=TeamConfig(num_pois=(1, 4), robots_each=1, alone=1.0, second_cost=0.125, max_steps=12),
+    team=TeamConfig(num_pois=(1, 4), second_cost=0.125),
 )
 ONLY_CAMERAS = dataclasses.replace(
     TEAM,
@@ -76,7 +76,8 @@ def team() -> TeamMdp:
     """The MDP of a team, with an untrained JMVAE."""
     mdp = make_mdp(TEAM, init(jax.random.key(0), TEAM), Bank(noisy_bank(jax.random.key(1), TEAM)))
     assert isinstance(mdp, TeamMdp)
-    return mdp
+    # No interface may have the lonely episodes.
+    return dataclasses.replace(mdp, robots_each=1, alone=1.0, max_steps=12)
 
 
 @functools.cache

@@ -34,8 +34,7 @@ def step(key, robots, state, actions):
 
 
 def with_limit(robots, number):
-    config = dataclasses.replace(robots.mdp.config, max_steps=number)
-    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, config=config))
+    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, max_steps=number))
 
 
 def test_the_whole_team_starts_and_is_never_alone(robots):
@@ -58,7 +57,7 @@ def test_every_step_equals_the_mdps(robots):
     mdp = robots.mdp
     mdp_step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
     observe = jax.jit(
-        lambda s, r: team_mdp.observation(mdp.config.travel, s.map.belief, s.team, r, 2)
+        lambda s, r: team_mdp.observation(mdp.travel, s.map.belief, s.team, r, 2)
     )
     state = expected = reset(jax.random.key(3), robots)
     turns, looks = [], 0

@@ -66,7 +66,7 @@ def as_numpy():
     return lambda tree: jax.tree.map(np.asarray, tree)
 
 
-_RULES = {"auctions": False, "nearest_first": True, "redecides": True, "avoids_targets": True}
+_RULES = {"auctions": False}
 
 
 @pytest.fixture(scope="session")

@@ -3,9 +3,9 @@
 import jax.numpy as jnp
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, NavigationConfig
+from jaxsense.config import ArenaConfig
 
-ARENA, SETTINGS = ArenaConfig(), NavigationConfig()
+ARENA = ArenaConfig()
 PERIOD = 0.1  # s
 
 

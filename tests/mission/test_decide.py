@@ -114,28 +114,14 @@ def test_when_nothing_beats_nop_the_robot_ends(chosen):
 
 
 @pytest.mark.parametrize("policy", [LATENT, NAIVE])
-@pytest.mark.parametrize(("is_nearest_first", "target"), [(True, 1), (False, 0)])
-def test_of_equal_values_the_nearest_or_else_the_first_is_taken(
-    chosen, policy, is_nearest_first, target
-):
-    state = chosen([1.0] * 3 + [0.0], policy, nearest_first=is_nearest_first)
-    assert state.robots.target[0] == target
+def test_of_equal_values_the_nearest_is_taken(chosen, policy):
+    assert chosen([1.0] * 3 + [0.0], policy).robots.target[0] == 1
 
 
 @pytest.mark.parametrize("policy", [LATENT, NAIVE])
-@pytest.mark.parametrize(("avoids", "target"), [(True, 0), (False, 1)])
-def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(
-    chosen, set_robot, policy, avoids, target
-):
+def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(chosen, set_robot, policy):
     heading = lambda state: set_robot(state, 1, target=1)  # noqa: E731
-    state = chosen([1.0] * 3 + [0.0], policy, heading, avoids_targets=avoids)
-    assert state.robots.target[0] == target
-
-
-def test_the_first_that_nobody_heads_for_is_taken_where_distances_do_not_count(chosen, set_robot):
-    heading = lambda state: set_robot(state, 1, target=0)  # noqa: E731
-    state = chosen([1.0] * 3 + [0.0], change=heading, nearest_first=False)
-    assert state.robots.target[0] == 1
+    assert chosen([1.0] * 3 + [0.0], policy, heading).robots.target[0] == 0
 
 
 def test_a_poi_that_was_given_up_is_left_out(chosen, set_robot):
@@ -297,18 +283,16 @@ def test_random_takes_every_poi_and_nop_equally_often(team, models, arena_of):
 
 @pytest.mark.parametrize("phase", [DRIVING, FACING])
 @pytest.mark.parametrize("policy", [LATENT, NAIVE])
-@pytest.mark.parametrize(
-    ("version", "redecides", "target"), [(1, True, 2), (0, True, 0), (1, False, 0)]
-)
+@pytest.mark.parametrize(("version", "target"), [(1, 2), (0, 0)])
 def test_a_changed_map_makes_a_robot_decide_again(
-    chosen, set_robot, phase, policy, version, redecides, target
+    chosen, set_robot, phase, policy, version, target
 ):
     def under_way(state):
         # Of the naive policy only PoI 2 is left, which is the best of the latent one.
         state = seen_by([1, 1, 0])(replace(state, version=jnp.int32(version)))
         return set_robot(state, 0, phase=phase, target=0, goals=1, attempts=1)
 
-    state = chosen([0.0, 0.0, 1.0, 0.5], policy, under_way, redecides=redecides)
+    state = chosen([0.0, 0.0, 1.0, 0.5], policy, under_way)
     assert state.robots.target[0] == target
     if target == 2:
         assert state.robots.phase[0] == DRIVING

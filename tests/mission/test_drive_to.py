@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from navigating import ARENA, PERIOD, SETTINGS, layout_of
+from navigating import ARENA, PERIOD, layout_of
 
 from jaxsense import sim
 from jaxsense.mission import navigation
@@ -18,9 +18,7 @@ def turned(angle, x, y):
 @pytest.fixture(scope="module")
 def command_to():
     """The command that `drive_to` gives robot 0, with one or two robots."""
-    drive_to = jax.jit(
-        functools.partial(navigation.drive_to, SETTINGS, ARENA), static_argnums=(3, 5)
-    )
+    drive_to = jax.jit(functools.partial(navigation.drive_to, ARENA), static_argnums=(3, 5))
 
     def command(layout, poses, commands, waypoint, backs_off=False):
         state = jnp.array(poses, jnp.float32), jnp.array(commands, jnp.float32)
@@ -30,7 +28,7 @@ def command_to():
     return command
 
 
-arcs_of = jax.jit(functools.partial(navigation._arcs, SETTINGS), static_argnums=1)
+arcs_of = jax.jit(navigation._arcs, static_argnums=1)
 
 
 @pytest.mark.parametrize("turn_rate", [-0.97, 0.0, 0.35])
@@ -96,7 +94,7 @@ def test_commands_stay_within_the_accelerations_of_the_robot(seconds):
         commands = jax.random.uniform(keys[2], (2, 2), minval=low, maxval=high)
         waypoint = jax.random.uniform(keys[3], (2,), minval=-1.4, maxval=1.4)
         args = layout, poses, commands, 1, waypoint, seconds, jnp.bool_(False)
-        return commands[1], navigation.drive_to(SETTINGS, ARENA, *args)
+        return commands[1], navigation.drive_to(ARENA, *args)
 
     present, wanted = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), 500))
     moves = np.any(np.array(wanted) != 0, axis=-1)
@@ -250,7 +248,7 @@ def test_a_robot_that_backs_off_gains_room(command_to, poses, in_the_way, forwar
 
 def drive(poses, commands, waypoint):
     args = jnp.zeros(poses), jnp.zeros(commands), 0, jnp.zeros(waypoint), PERIOD, jnp.bool_(False)
-    return navigation.drive_to(SETTINGS, ARENA, layout_of(), *args)
+    return navigation.drive_to(ARENA, layout_of(), *args)
 
 
 @pytest.mark.parametrize(
@@ -274,7 +272,7 @@ def test_wrong_shapes_are_named_while_tracing(name, call, right, wrong):
 
 @pytest.mark.parametrize("horizon", [1.0, 4.0])
 def test_a_robot_may_leave_its_arc_after_half_the_horizon(horizon):
-    settings = dataclasses.replace(SETTINGS, horizon=horizon)
+    settings = dataclasses.replace(horizon=horizon)
     waypoint = jnp.array([0.1 * horizon / 2, 0.0])  # where it is by then at 0.1 m/s
     args = layout_of(), jnp.zeros((1, 3)), jnp.array([[0.2, 0.0]]), 0, waypoint, PERIOD
     drive_to = jax.jit(functools.partial(navigation.drive_to, settings, ARENA, *args))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from navigating import ARENA, PERIOD, SETTINGS, layout_of
+from navigating import ARENA, PERIOD, layout_of
 
 from jaxsense import sim
 from jaxsense.config import Config
@@ -65,7 +65,7 @@ def driven():
                 args = ways.to_viewpoint(poi, view), poses[0, :2], far, poi, view
                 _, waypoint = roadmap.next_waypoint(CONFIG, layout, ways, *args)
             args = poses, commands, 0, waypoint, PERIOD, jnp.bool_(False)
-            wanted = navigation.drive_to(SETTINGS, ARENA, layout, *args)
+            wanted = navigation.drive_to(ARENA, layout, *args)
             poses, commands, clearance = move(layout, poses, commands, wanted[None])
             return (poses, commands), (poses[0, :2], clearance)
 
@@ -129,7 +129,7 @@ def met():
             poses, commands = state
             wanted = [
                 navigation.drive_to(
-                    SETTINGS, ARENA, layout_of(), poses, commands, r, goal, PERIOD, jnp.bool_(False)
+                    ARENA, layout_of(), poses, commands, r, goal, PERIOD, jnp.bool_(False)
                 )
                 for r, goal in enumerate(goals)
             ]
@@ -176,7 +176,7 @@ def test_a_robot_drives_around_one_that_stands_in_its_way(met):
 
 @pytest.fixture(scope="module")
 def sidestep():
-    step = jax.jit(functools.partial(navigation.sidestep, SETTINGS, ARENA))
+    step = jax.jit(functools.partial(navigation.sidestep, ARENA))
 
     def from_origin(others, layout=None, place=(0.0, 0.0)):
         """The next place on the way to 1 m further east, seen from where the robot is."""

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from navigating import ARENA, PERIOD, SETTINGS, layout_of
+from navigating import ARENA, PERIOD, layout_of
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig
@@ -22,12 +22,12 @@ def random_layout(key, arena):
 
 def drive(arena, layout, poses):
     rest = jnp.zeros((len(poses), 2)), 0, jnp.array([0.3, 0.2]), PERIOD, jnp.bool_(False)
-    return navigation.drive_to(SETTINGS, arena, layout, poses, *rest)
+    return navigation.drive_to(arena, layout, poses, *rest)
 
 
 def sidestep(arena, layout, poses):
     place, waypoint, blocking = poses[0, :2], jnp.array([0.3, 0.2]), poses[1:, :2]
-    return navigation.sidestep(SETTINGS, arena, layout, place, waypoint, blocking)
+    return navigation.sidestep(arena, layout, place, waypoint, blocking)
 
 
 @pytest.mark.parametrize("function", [drive, sidestep, navigation.clearance])
@@ -49,7 +49,7 @@ def command_to():
         poses = jnp.concatenate([jnp.zeros((1, 3)), others])
         commands = jnp.concatenate([jnp.array([[0.2, 0.0]]), commands])
         args = 0, jnp.array([1.0, 0.0]), PERIOD, jnp.bool_(False)
-        return navigation.drive_to(SETTINGS, ARENA, layout, poses, commands, *args)
+        return navigation.drive_to(ARENA, layout, poses, commands, *args)
 
     return command
 
@@ -84,7 +84,7 @@ def test_each_of_several_pois_is_kept_clear_of(command_to, slot):
 
 
 def test_of_several_robots_in_the_way_the_last_is_passed():
-    step = jax.jit(functools.partial(navigation.sidestep, SETTINGS, ARENA, layout_of()))
+    step = jax.jit(functools.partial(navigation.sidestep, ARENA, layout_of()))
     place, waypoint = jnp.zeros(2), jnp.array([1.0, 0.0])
     near, far, aside = jnp.array([0.4, 0.05]), jnp.array([0.7, -0.05]), jnp.array([0.5, 0.6])
     alone = {name: step(place, waypoint, other[None]) for name, other in (("n", near), ("f", far))}

@@ -10,7 +10,7 @@ import pytest
 from teams import CONFIG, POSES, POSITIONS, alone, with_config, with_values
 
 from jaxsense import mission
-from jaxsense.config import LocalisationConfig, SearchConfig
+from jaxsense.config import LocalisationConfig, Search
 from jaxsense.mission import act, decide
 from jaxsense.mission.rollout import _drift
 from jaxsense.mission.state import DRIVING, FACING
@@ -80,26 +80,26 @@ def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain
     def is_there(scan, search, bearing=0.0):
         return detects(scan, search, np.float32(bearing))
 
-    assert not is_there(scan, SearchConfig())
-    assert is_there(scan, SearchConfig(heading=14.0))
-    assert is_there(scan[::-1], SearchConfig(heading=14.0))
-    assert not is_there(scan, SearchConfig(heading=5.0))
+    assert not is_there(scan, Search())
+    assert is_there(scan, Search(heading=14.0))
+    assert is_there(scan[::-1], Search(heading=14.0))
+    assert not is_there(scan, Search(heading=5.0))
     # What is wrong elsewhere in the scan does not matter, and nobody searches beyond its ends.
     broken = np.where(np.arange(len(scan)) < 260, np.nan, scan)
-    assert is_there(broken, SearchConfig(heading=14.0))
-    assert not is_there(np.where(scan == 3.0, np.nan, scan), SearchConfig(heading=14.0))
-    assert not is_there(scan, SearchConfig(heading=30.0), 2.5)
+    assert is_there(broken, Search(heading=14.0))
+    assert not is_there(np.where(scan == 3.0, np.nan, scan), Search(heading=14.0))
+    assert not is_there(scan, Search(heading=30.0), 2.5)
 
 
 @pytest.mark.parametrize("robot", [pytest.param(CAMERA, marks=pytest.mark.slow), LIDAR])
 @pytest.mark.parametrize(
     ("search", "degrees", "aside", "detections"),
     [
-        (SearchConfig(heading=12.0), -15.0, 0.0, 1),
-        pytest.param(SearchConfig(heading=3.0), -15.0, 0.0, 0, marks=pytest.mark.slow),
+        (Search(heading=12.0), -15.0, 0.0, 1),
+        pytest.param(Search(heading=3.0), -15.0, 0.0, 0, marks=pytest.mark.slow),
         # .2 m across a view of .8 m are 14 degrees.
-        pytest.param(SearchConfig(position=0.15), 0.0, 0.2, 1, marks=pytest.mark.slow),
-        pytest.param(SearchConfig(position=0.04), 0.0, 0.2, 0, marks=pytest.mark.slow),
+        pytest.param(Search(position=0.15), 0.0, 0.2, 1, marks=pytest.mark.slow),
+        pytest.param(Search(position=0.04), 0.0, 0.2, 0, marks=pytest.mark.slow),
     ],
 )
 def test_a_robot_that_searches_finds_what_its_errors_explain(
@@ -116,7 +116,7 @@ def test_a_robot_that_searches_tries_other_distances(searches, facing):
     # The LiDAR refuses what is more than .24 m nearer than expected. The cube's side is, by .3 m.
     state = facing(LIDAR, [0.0, 0.0, 0.0], [-0.2, 0.0, 0.0])
     for position, detections in ((0.03, 0), (0.12, 1)):
-        robots = searches(SearchConfig(position=position))(state, LIDAR).robots
+        robots = searches(Search(position=position))(state, LIDAR).robots
         assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
 
 
@@ -127,7 +127,7 @@ def test_a_robot_that_searches_looks_from_farther_away(team, facing):
         lambda config, state: decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))
     )
     for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
-        assert bool(sees(searching(SearchConfig(position=position)), state)) is expected
+        assert bool(sees(searching(Search(position=position)), state)) is expected
 
 
 def searching(search):
@@ -181,7 +181,7 @@ def test_a_robot_chooses_the_poi_that_it_believes_to_be_nearest(arena_of, models
 
 
 def test_errors_are_of_the_robots_that_drive(team, arena_of):
-    localised = LocalisationConfig(position_drift=0.1, heading_drift=5.0)
+    localised = LocalisationConfig(drift=(0.1, 5.0))
     config = replace(CONFIG, mission=replace(CONFIG.mission, localisation=localised))
     before = arena_of(POSITIONS, POSES)
     poses = before.scene.poses.at[1, 0].add(0.02)
@@ -201,7 +201,7 @@ def test_errors_are_of_the_robots_that_drive(team, arena_of):
 
 
 def test_a_mission_starts_with_constant_errors(team, models):
-    localised = LocalisationConfig(position_error=0.1, heading_error=5.0)
+    localised = LocalisationConfig(error=(0.1, 5.0))
 
     @jax.jit
     def begin(keys, localisation):

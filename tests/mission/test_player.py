@@ -21,7 +21,7 @@ from jaxsense.run.monitor import Monitor, StageError
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK = batches.chunk_of(CONFIG)
+CHUNK = batches.CHUNK
 SHORT = dataclasses.replace(CONFIG.mission, time_limit=30.0)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
@@ -217,7 +217,3 @@ def test_values_that_are_not_finite_end_the_missions(play):
 
     with pytest.raises(StageError, match="mission: values of policy naive are not finite"):
         play(step=lost)
-
-
-def test_a_short_time_limit_changes_no_program():
-    assert batches.chunk_of(dataclasses.replace(CONFIG, mission=SHORT)) == CHUNK

@@ -10,6 +10,7 @@ import pytest
 from teams import CONFIG
 
 from jaxsense import mission
+from jaxsense.config import CONTROL_PERIOD
 from jaxsense.mission import act, navigation
 from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
 from jaxsense.sim import amiro
@@ -18,7 +19,7 @@ from jaxsense.sim import arena as arenas
 LATENT, NAIVE = 0, 1
 STEPS, CHUNK = 240, 40
 NUM_POIS = CONFIG.arena.num_pois
-PERIOD = CONFIG.mission.control_period
+PERIOD = CONTROL_PERIOD
 FAULT_TIME = 4.0  # s
 NEVER = (np.inf, np.inf)
 # For each case: when robots stop and go blind, and the number of its arenas.

@@ -37,7 +37,7 @@ def test_limits_are_those_of_the_settings():
 
 
 def test_errors_of_poses_in_training_widen_the_limits():
-    errors = LocalisationConfig(in_training=True, position_error=0.02, heading_error=1.0)
+    errors = LocalisationConfig(in_training=True, error=(0.02, 1.0))
     mission = dataclasses.replace(CONFIG.mission, localisation=errors)
     found = make_domain(dataclasses.replace(CONFIG, mission=mission), CAMERA)
     np.testing.assert_allclose(found.distance, [0.24, 1.26], rtol=1e-5)

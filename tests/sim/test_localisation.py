@@ -13,7 +13,7 @@ from jaxsense.sim import localisation, world
 
 
 def test_constant_errors_have_their_standard_deviations():
-    config = LocalisationConfig(position_error=0.03, heading_error=2.0)
+    config = LocalisationConfig(error=(0.03, 2.0))
     errors = np.asarray(localisation.draw(jax.random.key(0), config, 20_000))
     expected = [0.03, 0.03, np.radians(2.0)]
     np.testing.assert_allclose(errors.std(axis=0), expected, rtol=0.02)
@@ -25,7 +25,7 @@ def test_constant_errors_have_their_standard_deviations():
 
 
 def test_drift_grows_with_the_root_of_the_distance():
-    config = LocalisationConfig(position_drift=0.02, heading_drift=1.0)
+    config = LocalisationConfig(drift=(0.02, 1.0))
     before = jnp.full((20_000, 3), 0.5)
     for driven in (1.0, 0.25, 4.0):
         after = localisation.drift(jax.random.key(0), config, before, jnp.full(len(before), driven))
@@ -65,7 +65,7 @@ def simulation():
 
 
 def test_training_looks_have_the_bearing_and_distance_of_a_misplaced_robot(simulation):
-    errors = LocalisationConfig(position_error=0.01, heading_error=2.0)
+    errors = LocalisationConfig(error=(0.01, 2.0))
     keys = jax.random.split(jax.random.key(0), 20_000)
 
     @jax.jit
@@ -96,18 +96,18 @@ def test_surveys_expect_pois_where_misplaced_robots_do(simulation):
         return scenes.poses, windows[1], distances
 
     poses, windows, distances = survey(None)
-    same, others, apart = survey(LocalisationConfig(position_error=0.05))
+    same, others, apart = survey(LocalisationConfig(error=(0.05, 0.0)))
     np.testing.assert_array_equal(poses, same)
     assert np.std(apart - distances) == pytest.approx(0.05, rel=0.15)
     assert np.any(windows != others)
-    _, turned, exact = survey(LocalisationConfig(heading_error=5.0))
+    _, turned, exact = survey(LocalisationConfig(error=(0.0, 5.0)))
     np.testing.assert_allclose(exact, distances, atol=1e-6)
     assert np.any(windows != turned)
 
 
 def test_training_has_the_errors_only_where_the_settings_say_so(simulation):
     assert simulation.localisation is None
-    config, errors = PRESETS["smoke"], LocalisationConfig(in_training=True, heading_error=3.0)
+    config, errors = PRESETS["smoke"], LocalisationConfig(in_training=True, error=(0.0, 3.0))
     mission = replace(config.mission, localisation=errors)
     made = world.make_world(replace(config, mission=mission), arena=simulation.arena)
     assert made.localisation == errors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import PRESETS
-from jaxsense.config import SearchConfig
+from jaxsense.config import Search
 from jaxsense.sim import search, sensors, windows
 
 CAMERA, LIDAR = sensors.make(PRESETS["default"])
@@ -18,17 +18,17 @@ BOTH = pytest.mark.parametrize("sensor", [CAMERA, LIDAR], ids=["camera", "lidar"
 def test_a_search_reads_as_many_more_rays_as_its_errors_need():
     # The LiDAR's rays are 240 / 682 = .3519 degrees apart, and 6 / .3519 = 17.05. Every fourth of
     # the camera's is read, 4 x 80 / 639 = .5008 apart, and 6 / .5008 = 11.98.
-    heading = SearchConfig(heading=6.0)
+    heading = Search(heading=6.0)
     assert search.widened(LIDAR, heading).window == LIDAR.window + 2 * 18
     assert search.widened(CAMERA, heading).window == CAMERA.window + 2 * 12
     # .15 m across .3 m are half a radian or 28.65 degrees, and 28.65 / .3519 = 81.41.
-    position = SearchConfig(position=0.15)
+    position = Search(position=0.15)
     assert search.widened(LIDAR, position).window == LIDAR.window + 2 * 82
     # The larger of two errors counts more: (6^2 + 28.65^2)^.5 = 29.27, and / .3519 = 83.2.
-    both = SearchConfig(position=0.15, heading=6.0)
+    both = Search(position=0.15, heading=6.0)
     assert search.widened(LIDAR, both).window == LIDAR.window + 2 * 84
     # The camera has 640 rays, of which 160 are read.
-    wide = SearchConfig(position=0.3, heading=30.0)
+    wide = Search(position=0.3, heading=30.0)
     assert search.widened(CAMERA, wide).window == 160
 
 
@@ -51,7 +51,7 @@ def searching(name, errors):
 @BOTH
 @pytest.mark.parametrize("bearing", [-0.1, 0.001, 0.07])  # no half rays
 def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
-    errors, scan = SearchConfig(heading=3.0), readings_of(sensor)
+    errors, scan = Search(heading=3.0), readings_of(sensor)
     found = searching(sensor.name, errors)(scan, bearing, 0.8)
     half = len(found.windows) // 2
     first = windows._first_ray(sensor, jnp.float32(bearing))
@@ -62,7 +62,7 @@ def test_each_window_is_the_plain_one_at_another_bearing(sensor, bearing):
 
 
 def test_a_search_is_as_wide_as_its_errors_explain():
-    scan, errors = readings_of(LIDAR), SearchConfig(position=0.09, heading=2.0)
+    scan, errors = readings_of(LIDAR), Search(position=0.09, heading=2.0)
     # The middle of 128 rays is half way between two of them.
     ahead = np.radians(240 / 682 / 2)
     for distance in (0.5, 2.0):
@@ -87,7 +87,7 @@ def test_a_search_is_as_wide_as_its_errors_explain():
 
 @BOTH
 def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
-    errors = SearchConfig(heading=1e-3)
+    errors = Search(heading=1e-3)
     found = searching(sensor.name, errors)(readings_of(sensor), 0.013, 1.0)
     is_tried = np.isfinite(found.log_prior).all(axis=0)
     np.testing.assert_array_equal(is_tried, np.arange(len(is_tried)) == len(is_tried) // 2)
@@ -102,7 +102,7 @@ def readings_of(sensor):
 
 def test_small_errors_of_position_try_other_distances_too():
     sensor = sensors.make(PRESETS["default"])[1]
-    given = SearchConfig(position=0.01)
+    given = Search(position=0.01)
     window = jnp.ones(search.widened(sensor, given).window)
     found = search.candidates(sensor, given, window, jnp.float32(0), jnp.float32(1))
     np.testing.assert_allclose(found.distances, [0.99, 1.0, 1.01], rtol=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Config, ConfigError, ViewpointConfig
+from jaxsense.config import CLEARANCE, ArenaConfig, Config, ConfigError, ViewpointConfig
 from jaxsense.sim import viewpoints, world
 
 CLASSES = jnp.array([0, 1, 2])  # green cylinder, red cylinder, red cube
@@ -77,7 +77,7 @@ def room(x, y, others, poi=0):
     position = jnp.array([[0.0, 0.0], [1.0, 0.0], [-1.0, -1.0]])
     layout = sim.make_layout(ArenaConfig(), position, jnp.zeros(3), CLASSES)
     place = jnp.array([x]), jnp.array([y])
-    config = ViewpointConfig().clearance, ArenaConfig(), layout
+    config = CLEARANCE, ArenaConfig(), layout
     return float(viewpoints.free_room(*place, *config, jnp.array(others), jnp.int32(poi))[0])
 
 
@@ -193,20 +193,19 @@ def test_look_is_centred_on_the_poi(looks):
 def test_the_world_of_other_settings_keeps_the_arena():
     config = Config()
     made = world.make_world(config)
-    ahead = dataclasses.replace(config.viewpoint, max_bearing=0.0)
+    near = dataclasses.replace(config.viewpoint, max_distance=0.31)
 
     @jax.jit
     @chex.assert_max_traces(n=1)
-    def turns(config):
+    def distances(config):
         here = world.make_world(config, arena=made.arena)
         assert here.arena is made.arena
         scene = world.random_scene(jax.random.key(0), here, CLASSES)
-        bearings = jax.vmap(jax.vmap(sim.bearing, (None, 0)), (0, None))
-        return jnp.abs(bearings(scene.poses, scene.layout.position)).min(axis=-1)
+        apart = scene.poses[:, None, :2] - scene.layout.position[None]
+        return jnp.linalg.norm(apart, axis=-1).min(axis=-1)
 
-    # Each robot faces a PoI, up to 20 degrees to either side or not at all.
-    assert turns(config).max() > 0.01
-    assert turns(dataclasses.replace(config, viewpoint=ahead)).max() < 1e-5
+    assert distances(config).max() > 0.32
+    assert distances(dataclasses.replace(config, viewpoint=near)).max() < 0.311
     other = dataclasses.replace(config, arena=ArenaConfig(side=4.0))
     with pytest.raises(ValueError, match="arena: must be compiled"):
         world.make_world(other, arena=made.arena)

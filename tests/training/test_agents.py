@@ -134,9 +134,7 @@ def test_the_network_of_a_team_is_evaluated_with_its_first_sensor():
 TOURS = dataclasses.replace(
     TINY,
     dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
-    team=TeamConfig(
-        num_pois=(2, 3), tours=ToursConfig(states=20, tries=2, walk=1, steps=41, batch=8)
-    ),
+    team=TeamConfig(num_pois=(2, 3), tours=ToursConfig(states=20, steps=41)),
 )
 
 

@@ -9,7 +9,7 @@ import pytest
 from by_hand import CONFIG, EXACT, KEY, detections, in_place
 
 import jaxsense
-from jaxsense.config import EvaluationConfig, FilterConfig
+from jaxsense.config import EvaluationConfig
 from jaxsense.dqn import map_mdp, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae, make_prior
@@ -88,7 +88,7 @@ def test_values_that_are_not_numbers_give_totals_that_are_none():
 @pytest.mark.slow
 def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks():
     model, prior, classes = make_jmvae(CONFIG), make_prior(CONFIG), in_place().classes
-    fusion = filter.init(KEY, model, classes, prior, FilterConfig(hidden=(1,)))
+    fusion = filter.init(KEY, model, classes, prior, (1,))
     # No look of the camera pays by its total, and every look of the LiDAR does.
     models = models_with(jnp.zeros(4), (constant(1.0, -1.0), constant(-1.0, 1.0)), fusion)
     total, _ = play(jnp.int32(0), models, EXACT)["optimal"]

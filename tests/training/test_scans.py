@@ -25,10 +25,10 @@ TINY = dataclasses.replace(
     SMOKE,
     detector=DetectorConfig(num_scans=120, calibration=0.25, num_held_out=36, steps=2, batch=8),
     jmvae=JmvaeConfig(
-        learns_from="scans", fusion="filter", looks=3, hidden=(8,), steps=2, batch=4,
+        learns_from="scans", fusion="filter", hidden=(8,), steps=2, batch=4,
         restarts=2, samples_per_class=12,
     ),
-    filter=FilterConfig(steps=2, batch=4),
+    filter=FilterConfig(steps=2),
 )  # fmt: skip
 KEY = jax.random.key(0)
 
@@ -236,7 +236,7 @@ def test_calibration_leaves_a_group_to_learn_from():
 
 
 def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
-    dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_starts=64)
+    dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_envs=4)
     config = dataclasses.replace(TINY, dqn=dqn)
     num_train, num_bank, num_held_out, num_empty = num_scenes(config)
     total = num_train + num_bank + num_held_out + num_empty

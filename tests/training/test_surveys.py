@@ -60,7 +60,7 @@ MEASURED = dataclasses.replace(
     SMOKE,
     detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
     jmvae=JmvaeConfig(samples_per_class=10),
-    dqn=dataclasses.replace(SMOKE.dqn, observe="live", num_starts=2 * SMOKE.dqn.num_envs),
+    dqn=dataclasses.replace(SMOKE.dqn, observe="live", num_envs=4),
 )
 
 

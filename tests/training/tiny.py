@@ -17,8 +17,7 @@ TINY = dataclasses.replace(
     detector=DetectorConfig(hidden=(8,), num_scans=96, num_held_out=48, steps=41, batch=16),
     jmvae=JmvaeConfig(hidden=(8,), restarts=2, samples_per_class=32, steps=41, batch=16),
     dqn=dataclasses.replace(
-        SMOKE.dqn, hidden=(8,), num_envs=8, epochs=4, chunk=2, updates=2, batch=16,
-        replay_capacity=64, num_starts=8,
+        SMOKE.dqn, hidden=(8,), num_envs=8, epochs=4, updates=2, batch=16, replay_capacity=64,
     ),
     mission=MissionConfig(episodes=1, time_limit=0.5),
 )  # fmt: skip

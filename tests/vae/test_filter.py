@@ -24,8 +24,8 @@ PRIOR = fusion.prior(MODEL, 20.0)
 NOBODY = np.zeros(2, bool)
 
 
-def untrained(config=FilterConfig(hidden=(1,))):  # noqa: B008
-    return filter.init(jax.random.key(0), MODEL, CLASSES, PRIOR, config)
+def untrained(hidden=(1,)):
+    return filter.init(jax.random.key(0), MODEL, CLASSES, PRIOR, hidden)
 
 
 def exact():
@@ -103,13 +103,13 @@ def test_looks_come_to_the_same_in_any_order_and_together():
     )
 
 
-TRAINED = FilterConfig(hidden=(16,), steps=600, batch=128)
+TRAINED = FilterConfig(steps=600)
 
 
 @pytest.fixture(scope="module")
 def trained():
     """A filter after two chunks of half its training, and all losses."""
-    found = untrained(TRAINED)
+    found = untrained((16,))
     problem = filter.Fitting(TRAINED, found, bank(jax.random.key(2), 4000))
     train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
     state, losses = supervised.start(found.networks, TRAINED), []

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import FilterConfig, JmvaeConfig
+from jaxsense.config import JmvaeConfig
 from jaxsense.core.types import Belief, Fusion
 from jaxsense.vae import filter, fusion, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
@@ -124,7 +124,7 @@ CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3
 KINDS = {
     "in_place": lambda: in_place(TWO, init(jax.random.key(0), TWO), CLASSES),
     "filter": lambda: filter.init(
-        jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), FilterConfig(hidden=(4,))
+        jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), hidden=(4,)
     ),
 }
 
