@@ -13,8 +13,8 @@ import rich.table
 
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row, reserve
-from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
+from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli, devices
 
 PROGRAM = "benchmarks"

@@ -23,7 +23,7 @@ from scipy import stats
 from benchmarks import measure, peers
 from jaxsense import vae
 from jaxsense.config import JmvaeConfig
-from jaxsense.config.checks import check_fields, limited
+from jaxsense.config.section import check_fields, limited
 from jaxsense.core.networks import Params
 from jaxsense.run import cli
 from jaxsense.vae import Jmvae

@@ -11,8 +11,8 @@ from typing import Annotated
 
 from jaxsense import summary
 from jaxsense.config import ConfigError
-from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import Name
+from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli
 from jaxsense.summary import Results, Summary
 

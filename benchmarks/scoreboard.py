@@ -20,8 +20,8 @@ import numpy as np
 import jaxsense
 from benchmarks import measure, peers
 from benchmarks.dqn import Dqn
-from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.options import Name
+from jaxsense.config.section import check_fields, limited, require
 from jaxsense.run import cli
 from jaxsense.tasks import Recurrent, Task, estimate
 from jaxsense.tasks.score import Policy

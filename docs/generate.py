@@ -14,9 +14,8 @@ from typing import Literal, get_args, get_origin, get_type_hints
 
 import jaxsense
 from jaxsense.config import PRESETS, Config, Shape
-from jaxsense.config.checks import Limits
 from jaxsense.config.options import docs
-from jaxsense.config.section import Section
+from jaxsense.config.section import Limits, Section
 from jaxsense.summary import BLOCKS
 
 DOCS = Path(__file__).parent

@@ -11,8 +11,8 @@ import rich.console
 
 from jaxsense import mission, summary
 from jaxsense.config import ConfigError
-from jaxsense.config.checks import check_fields, require
 from jaxsense.config.options import command
+from jaxsense.config.section import check_fields, require
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler

@@ -14,9 +14,9 @@ import rich.table
 
 from jaxsense import mission, summary
 from jaxsense.config import CONTROL_PERIOD, TIMESTEP, Config, ConfigError
-from jaxsense.config.checks import check_fields, limited, require
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
+from jaxsense.config.section import check_fields, limited, require
 from jaxsense.run import batches, cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError

@@ -20,8 +20,8 @@ import rich.table
 
 from jaxsense import mission, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
-from jaxsense.config.checks import check_fields
 from jaxsense.config.options import Name, OptionError, command, read_some
+from jaxsense.config.section import check_fields
 from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir, seeds
 from jaxsense.run.devices import Workers
 from jaxsense.run.interrupt import on_interrupt

@@ -4,8 +4,6 @@ An invalid value raises `ConfigError`, a `ValueError` whose one line names the f
 what would be right. The attribute docstrings are the text of `--help`.
 """
 
-from jaxsense.config.checks import ConfigError as ConfigError
-from jaxsense.config.checks import require_32_bits as require_32_bits
 from jaxsense.config.learning import DetectorConfig as DetectorConfig
 from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import EvaluationConfig as EvaluationConfig
@@ -25,27 +23,29 @@ from jaxsense.config.mission import LocalisationConfig as LocalisationConfig
 from jaxsense.config.mission import MissionConfig as MissionConfig
 from jaxsense.config.mission import NavigationConfig as NavigationConfig
 from jaxsense.config.mission import Search as Search
-from jaxsense.config.objects import COLOURS as COLOURS
-from jaxsense.config.objects import SHAPES as SHAPES
-from jaxsense.config.objects import Attribute as Attribute
-from jaxsense.config.objects import Shape as Shape
-from jaxsense.config.presets import PRESETS as PRESETS
-from jaxsense.config.presets import PresetName as PresetName
+from jaxsense.config.options import as_plain as as_plain
+from jaxsense.config.options import from_plain as from_plain
+from jaxsense.config.options import parse_json as parse_json
+from jaxsense.config.options import require_trust as require_trust
 from jaxsense.config.scene import CLEARANCE as CLEARANCE
+from jaxsense.config.scene import COLOURS as COLOURS
 from jaxsense.config.scene import LIDAR_HEIGHT as LIDAR_HEIGHT
 from jaxsense.config.scene import MAX_BEARING as MAX_BEARING
 from jaxsense.config.scene import MODALITIES as MODALITIES
 from jaxsense.config.scene import POI_HEIGHT as POI_HEIGHT
 from jaxsense.config.scene import ROBOT_RADIUS as ROBOT_RADIUS
+from jaxsense.config.scene import SHAPES as SHAPES
 from jaxsense.config.scene import TIMESTEP as TIMESTEP
 from jaxsense.config.scene import ArenaConfig as ArenaConfig
+from jaxsense.config.scene import Attribute as Attribute
 from jaxsense.config.scene import CameraConfig as CameraConfig
 from jaxsense.config.scene import LidarConfig as LidarConfig
 from jaxsense.config.scene import SensorConfig as SensorConfig
+from jaxsense.config.scene import Shape as Shape
 from jaxsense.config.scene import ViewpointConfig as ViewpointConfig
-from jaxsense.config.stored import as_plain as as_plain
-from jaxsense.config.stored import from_plain as from_plain
-from jaxsense.config.stored import parse_json as parse_json
-from jaxsense.config.stored import require_trust as require_trust
+from jaxsense.config.section import ConfigError as ConfigError
+from jaxsense.config.section import require_32_bits as require_32_bits
+from jaxsense.config.whole import PRESETS as PRESETS
 from jaxsense.config.whole import Config as Config
+from jaxsense.config.whole import PresetName as PresetName
 from jaxsense.config.whole import names_of_robots as names_of_robots

@@ -3,8 +3,7 @@
 import math
 from typing import Literal
 
-from jaxsense.config.checks import is_function_name, limited, require
-from jaxsense.config.section import Section, Traced
+from jaxsense.config.section import Section, Traced, is_function_name, limited, require
 
 PROFILE = 64
 """Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""

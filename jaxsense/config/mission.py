@@ -2,9 +2,8 @@
 
 from typing import NamedTuple
 
-from jaxsense.config.checks import limited, require
 from jaxsense.config.scene import ROBOT_RADIUS
-from jaxsense.config.section import Section, Traced
+from jaxsense.config.section import Section, Traced, limited, require
 
 MAX_EPISODES = 100_000
 """Maximum number of missions of one policy."""

@@ -1,10 +1,10 @@
-"""All sections together, and the checks between them."""
+"""All sections together, the checks between them, and presets."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
-from jaxsense.config.checks import ConfigError, limited, require
-from jaxsense.config.frozen import FrozenDict
 from jaxsense.config.learning import (
     DetectorConfig,
     DqnConfig,
@@ -13,21 +13,26 @@ from jaxsense.config.learning import (
     JmvaeConfig,
     MdpConfig,
     TeamConfig,
+    ToursConfig,
+    TravelConfig,
 )
 from jaxsense.config.mission import PLANNING_RADIUS, MissionConfig, NavigationConfig
-from jaxsense.config.objects import require_words
 from jaxsense.config.scene import (
     CLEARANCE,
+    COLOURS,
     MAX_BEARING,
     MODALITIES,
     ROBOT_RADIUS,
+    SHAPES,
     ArenaConfig,
     CameraConfig,
     LidarConfig,
     SensorConfig,
+    Shape,
     ViewpointConfig,
+    require_words,
 )
-from jaxsense.config.section import Section
+from jaxsense.config.section import ConfigError, FrozenDict, Section, limited, require
 
 _MAX_MODALITIES = 8  # the JMVAE has an encoder for each subset
 _MAX_ROBOTS = 64
@@ -68,7 +73,6 @@ class Config(Section):
     def check(self) -> None:
         """Checks relations between sections; raises `ConfigError`."""
         self._check_modalities()
-        self._check_robots()
         self._check_learning()
         self._check_task()
         self._check_viewpoints()
@@ -76,7 +80,7 @@ class Config(Section):
             self._check_profile()
 
     def _check_modalities(self) -> None:
-        """Modalities must be known; custom sensors must read an attribute, and all be read."""
+        """Modalities and robots must be known, and custom sensors read every attribute."""
         require_words(self.sensors, "sensors")
         attributes = ("colour", "shape", *self.arena.attributes)
         for name, sensor in self.sensors.items():
@@ -87,53 +91,42 @@ class Config(Section):
                 raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
         for name in self.arena.attributes:
             if name not in (sensor.attribute for sensor in self.sensors.values()):
-                raise ConfigError(
-                    "arena.attributes", name, "no sensor reads it; add one to sensors"
-                )
-        known = [*MODALITIES, *self.sensors]
-        is_known = set(self.modalities) <= set(known)
+                reason = "no sensor reads it; add one to sensors"
+                raise ConfigError("arena.attributes", name, reason)
+        known, names = [*MODALITIES, *self.sensors], self.modalities
+        is_known = set(names) <= set(known)
         require(is_known, self, "modalities", f"must be among {', '.join(known)}")
-        is_once = len(set(self.modalities)) == len(self.modalities)
-        require(is_once, self, "modalities", "must name no modality twice")
+        require(len(set(names)) == len(names), self, "modalities", "must name no modality twice")
         weights = self.jmvae.reconstruction_weights
-        expected = f"must have one value for each of modalities = {self.modalities}"
-        has_one_each = len(weights) == len(self.modalities)
-        require(has_one_each, self.jmvae, "reconstruction_weights", expected)
-
-    def _check_robots(self) -> None:
-        """Robots must carry trained sensors, which together distinguish some classes."""
-        is_trained = set(self.carried) <= set(self.modalities)
-        trained = ", ".join(self.modalities)
-        require(is_trained, self, "robots", f"must each be one of modalities: {trained}")
+        expected = f"must have one value for each of modalities = {names}"
+        require(len(weights) == len(names), self.jmvae, "reconstruction_weights", expected)
+        expected = f"must each be one of modalities: {', '.join(names)}"
+        require(set(self.carried) <= set(names), self, "robots", expected)
         if len(set(zip(*map(self.label_of_class, self.carried), strict=True))) == 1:
             expected = f"must distinguish some of {', '.join(self.arena.classes)}"
             raise ConfigError("robots", self.carried, expected)
 
     def _check_learning(self) -> None:
         """Beliefs must hold all labels, and calibration must leave scans to train on."""
+        jmvae, detector, num_classes = self.jmvae, self.detector, len(self.arena.classes)
         least = self._least_latent_size()
-        expected = (
-            f"must be at least {least}, so that beliefs can hold {len(self.arena.classes)} classes"
-        )
-        require(self.jmvae.latent_size >= least, self.jmvae, "latent_size", expected)
+        expected = f"must be at least {least}, so that beliefs can hold {num_classes} classes"
+        require(jmvae.latent_size >= least, jmvae, "latent_size", expected)
         # Scans come in whole scenes, and these in groups that show the same PoIs.
-        in_group = self.arena.num_pois * self.jmvae.num_together
-        groups = -(-self.detector.num_scans // in_group)
+        in_group = self.arena.num_pois * jmvae.num_together
+        groups = -(-detector.num_scans // in_group)
         scans = groups * in_group
-        parts = groups if self.jmvae.reads_scans else scans
-        leaves_some = self.detector.num_training(parts) > 0
+        leaves_some = detector.num_training(groups if jmvae.reads_scans else scans) > 0
         expected = f"leaves none of {scans} scans to train on; lower it"
-        require(leaves_some, self.detector, "calibration", expected)
-        num_classes = len(self.arena.classes)
-        of_class = -(-self.detector.num_held_out // num_classes)
+        require(leaves_some, detector, "calibration", expected)
         for section, field, number in (
-            (self.detector, "num_held_out", of_class),
-            (self.jmvae, "samples_per_class", self.jmvae.samples_per_class),
+            (detector, "num_held_out", -(-detector.num_held_out // num_classes)),
+            (jmvae, "samples_per_class", jmvae.samples_per_class),
         ):
             groups = -(-number * num_classes // in_group)
             expected = f"leaves some of {num_classes} classes without a look; raise it"
             require(groups * self.arena.num_pois >= num_classes, section, field, expected)
-        adds_up = self.jmvae.fusion == "filter" or not self.mission.communication.own_maps
+        adds_up = jmvae.fusion == "filter" or not self.mission.communication.own_maps
         expected = "must be off unless jmvae.fusion is 'filter', which accumulates looks"
         require(adds_up, self.mission.communication, "own_maps", expected)
 
@@ -150,8 +143,17 @@ class Config(Section):
 
     def _check_task(self) -> None:
         """What is learned must fit the task, and states that are partly seen a number."""
-        self._task.check(self)
-        most = max(self._task.most_pois(self), *self.evaluation.num_pois, 0)
+        team, most = self.team, self.arena.num_pois
+        if self.dqn.task == "team":
+            expected = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
+            require(self.dqn.observe == "bank", self.dqn, "observe", expected)
+            least = team.cells_per_side * self.arena.poi_pitch
+            expected = f"must be at least {least:.2f} m, so that {team.num_pois[1]} PoIs fit"
+            require(team.sides[0] >= least, team, "sides", expected)
+            most = max(team.num_pois[1], most, *self.evaluation.num_pois)
+        else:
+            expected = "must be empty unless dqn.task is 'team', which handles any number of PoIs"
+            require(not self.evaluation.num_pois, self.evaluation, "num_pois", expected)
         looks = most * len(self.modalities)
         is_right = not self.mdp.partly_seen_starts or 2 <= looks <= 30
         expected = f"must be off: it needs 2 to 30 pairs of PoI and modality, and there are {looks}"
@@ -166,7 +168,6 @@ class Config(Section):
         most = self.arena.side / 2
         expected = f"must be at most half the arena's side, {most} m"
         require(viewpoint.max_distance <= most, viewpoint, "max_distance", expected)
-
         farthest = navigation.view_range
         expected = f"must be at most viewpoint.max_distance = {viewpoint.max_distance} m"
         require(farthest <= viewpoint.max_distance, navigation, "view_range", expected)
@@ -175,9 +176,8 @@ class Config(Section):
         nearest = max(self.arena.poi_extent + PLANNING_RADIUS, nearest)
         expected = f"must be at least {nearest:.3f} m, where the robot is clear of the PoI"
         require(nearest <= farthest, navigation, "view_range", expected)
-
+        least = 2 * (MAX_BEARING + viewpoint.bearing_error)
         for name, sensor in {"camera": self.camera, "lidar": self.lidar}.items():
-            least = 2 * (MAX_BEARING + viewpoint.bearing_error)
             shows = name not in self.modalities or sensor.field_of_view >= least
             expected = f"must be at least {least:g} degrees, or robots miss the PoIs they look at"
             require(shows, sensor, "field_of_view", expected)
@@ -199,10 +199,6 @@ class Config(Section):
         most = math.floor(180 / pitch) + 1
         expected = f"must be from 3 to {most} to learn from scans: at most 180 degrees"
         require(3 <= lidar.window <= most, lidar, "window", expected)
-
-    @property
-    def _task(self) -> "_MapTask | _TeamTask":
-        return _TASKS[self.dqn.task]
 
     @property
     def carried(self) -> tuple[str, ...]:
@@ -250,33 +246,196 @@ def names_of_robots(carried: Sequence[str]) -> tuple[str, ...]:
     return tuple(name(robot, modality) for robot, modality in enumerate(carried))
 
 
-class _MapTask:
-    """What `dqn.task` = map asks of the settings: a dense network is for one number of PoIs."""
+_PAPER = Config(
+    jmvae=JmvaeConfig(
+        alpha=1.0,
+        beta=0.1,
+        initial_beta=1.0,
+        restarts=1,
+        reconstruction_weights=(4.5, 4.5),
+    ),
+    mdp=MdpConfig(min_increase=0.01, partly_seen_starts=True),
+    dqn=DqnConfig(
+        observe="bank",
+        discount=0.95,
+        epochs=2000,
+        updates=32,
+        batch=512,
+        replay_capacity=1024000,
+        target_period=100,
+    ),
+    mission=MissionConfig(auctions=False),
+)
 
-    def check(self, config: Config) -> None:
-        is_empty = not config.evaluation.num_pois
-        expected = (
-            "must be empty unless dqn.task is 'team', whose policy handles any number of PoIs"
-        )
-        require(is_empty, config.evaluation, "num_pois", expected)
+_SMOKE = Config(
+    detector=DetectorConfig(num_scans=3072, num_held_out=1536, steps=300, batch=128),
+    jmvae=JmvaeConfig(restarts=1, samples_per_class=512, steps=300, batch=128),
+    dqn=DqnConfig(
+        observe="bank",
+        num_envs=32,
+        epochs=60,
+        batch=64,
+        replay_capacity=2048,
+    ),
+    team=TeamConfig(tours=ToursConfig(states=512, steps=60)),
+    evaluation=EvaluationConfig(
+        num_starts=32,
+        num_repeats=1,
+        num_histories=1020,
+        num_states=384,
+        value_looks=16,
+    ),
+    mission=MissionConfig(episodes=4, time_limit=60.0),
+)
 
-    def most_pois(self, config: Config) -> int:
-        return config.arena.num_pois
+_NOISY = Config(
+    arena=ArenaConfig(side=8.0),
+    lidar=LidarConfig(
+        range_noise=0.02,
+        range_noise_growth=0.01,
+        mixed_pixels=0.05,
+        dropout=0.01,
+        window_range=5.0,
+    ),
+    camera=CameraConfig(
+        pixel_noise=0.1,
+        exposure_error=0.3,
+        colour_cast=0.3,
+        low_light=0.95,
+        shadow=0.3,
+        stride=2,
+    ),
+    viewpoint=ViewpointConfig(max_distance=4.0),
+    detector=DetectorConfig(
+        hidden=(64, 64, 64),
+        num_scans=131072,
+        calibration=0.1,
+        num_held_out=32768,
+        num_repeats=12288,
+    ),
+    jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
+    mdp=MdpConfig(reward="nats", look_cost=0.1),
+    dqn=DqnConfig(observe="bank", discount=0.2),
+    team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
+    evaluation=EvaluationConfig(num_histories=65520, value_looks=128),
+    navigation=NavigationConfig(view_range=4.0),
+    mission=MissionConfig(
+        policies=(
+            *("latent", "greedy", "bayes", "optimal", "naive", "naive_2", "naive_3", "random"),
+            *("nearest", "auction", "rollout"),
+        ),
+        episodes=64,
+        least_confidence=0.0,
+        equal_values=0.05,
+    ),
+)
 
+_RAW = Config(
+    detector=DetectorConfig(calibration=0.1),
+    jmvae=JmvaeConfig(
+        learns_from="scans",
+        hidden=(128, 128),
+        alpha=3.0,
+        beta=1.0,
+        initial_beta=0.01,
+        annealing=0.3,
+        reconstruction_weights=(10.0, 60.0),
+        fusion="filter",
+        restarts=1,
+        steps=4000,
+        batch=128,
+    ),
+)
 
-class _TeamTask(_MapTask):
-    """What `dqn.task` = team asks of the settings: a team learns from stored detections."""
+_TEAM = Config(
+    arena=ArenaConfig(side=4.0, num_pois=8),
+    dqn=DqnConfig(
+        task="team",
+        observe="bank",
+        hidden=(32, 32),
+        epochs=600,
+        updates=16,
+        replay_capacity=131072,
+        discount=0.2,
+        epsilon_min=0.05,
+        target_period=5,
+    ),
+    evaluation=EvaluationConfig(num_pois=(3, 8, 20)),
+    mission=MissionConfig(
+        policies=("latent", "nearest", "auction", "rollout", "naive", "random"), time_limit=300.0
+    ),
+)
 
-    def check(self, config: Config) -> None:
-        expected = "must be 'bank' with dqn.task = 'team', whose MDP has no scans"
-        require(config.dqn.observe == "bank", config.dqn, "observe", expected)
-        team = config.team
-        least = team.cells_per_side * config.arena.poi_pitch
-        expected = f"must be at least {least:.2f} m, so that {team.num_pois[1]} PoIs fit"
-        require(team.sides[0] >= least, team, "sides", expected)
+_FOUR_SHAPES = {
+    **SHAPES,
+    # From its broad side like a cube, from its narrow side like a post.
+    "slab": Shape("box", half_sides=(1.0, 0.5)),
+    "post": Shape("box", half_sides=(0.5, 0.5)),
+}
 
-    def most_pois(self, config: Config) -> int:
-        return max(config.team.num_pois[1], config.arena.num_pois)
+_MANY = dataclasses.replace(
+    _NOISY,
+    robots=("camera", "camera", "lidar", "lidar"),
+    arena=ArenaConfig(
+        side=8.0,
+        num_pois=8,
+        # Four shapes need more beams than two.
+        poi_radius=0.15,
+        classes=tuple(f"{colour} {shape}" for colour in COLOURS for shape in _FOUR_SHAPES),
+        shapes=_FOUR_SHAPES,
+    ),
+    jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
+    mdp=MdpConfig(reward="nats", look_cost=0.05),
+    dqn=dataclasses.replace(_TEAM.dqn, hidden=(64, 64), updates=32),
+    # Learned orders do not know that a robot which looks again drives to another place.
+    team=dataclasses.replace(_NOISY.team, tours=ToursConfig(steps=0)),
+    evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),
+    mission=dataclasses.replace(
+        _NOISY.mission,
+        policies=(
+            "latent",
+            "greedy",
+            "nearest",
+            "auction",
+            "naive",
+            "naive_2",
+            "naive_3",
+            "random",
+        ),
+        episodes=32,
+        time_limit=300.0,
+    ),
+)
 
+# `recorded.fit_noise` of 704 laser scans, see `docs/robot.md`.
+_RECORDED = Config(
+    lidar=LidarConfig(
+        range_noise=0.0048, range_noise_growth=0.0005, mixed_pixels=0.21, dropout=0.00024
+    )
+)
 
-_TASKS = {"map": _MapTask(), "team": _TeamTask()}
+PresetName = Literal["default", "paper", "noisy", "many", "raw", "team", "recorded", "smoke"]
+"""Name of a preset, a key of `PRESETS`."""
+
+PRESETS: Mapping[str, Config] = FrozenDict(
+    {
+        "default": Config(),
+        "paper": _PAPER,
+        "noisy": _NOISY,
+        "many": _MANY,
+        "raw": _RAW,
+        "team": _TEAM,
+        "recorded": _RECORDED,
+        "smoke": _SMOKE,
+    }
+)
+"""Ready-made settings of a run, by name.
+
+`default`: the best settings we know. `paper`: the paper's settings where it states them, otherwise
+settings chosen to reproduce its figures, see `docs/differences.md`. `noisy`: detections that are
+often uncertain, and beliefs that accumulate looks. `many`: sixteen classes of four colours and four
+shapes, with the sensors of `noisy` and a team. `raw`: `default`, but the JMVAE learns from scans
+themselves, without detectors or labels. `team`: one policy for any number of PoIs and robots that
+takes travel time into account. `recorded`: `default` with the noise of a real laser scanner.
+`smoke`: the whole pipeline with very little training, for tests.
+"""

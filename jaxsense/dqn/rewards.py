@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import MdpConfig
-from jaxsense.config.checks import named_function
+from jaxsense.config.section import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, pytree
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 import jax.numpy as jnp
 
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.objects import require_words
+from jaxsense.config.scene import require_words
 from jaxsense.core import checks
 from jaxsense.dqn.policies import POLICIES, Policy, Values, table
 from jaxsense.mission.state import Faults, no_faults

@@ -225,9 +225,8 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], 
     sides = 2 * jnp.pi * jnp.arange(float(VIEW_SIDES)) / VIEW_SIDES
     nearest = config.viewpoint.min_distance + config.mission.localisation.search[0]
     nearest = jnp.maximum(config.arena.poi_extent + PLANNING_RADIUS, nearest)
-    near = jnp.maximum(VIEW_DISTANCES[0], nearest)
-    far = jnp.maximum(near, jnp.minimum(VIEW_DISTANCES[1], settings.view_range))
-    distances = jnp.stack([near, far])
+    distances = jnp.minimum(jnp.array(VIEW_DISTANCES), settings.view_range)
+    distances = jnp.maximum(distances, nearest)
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     positions = layout.position[:, None] + offsets[None]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import CONTROL_PERIOD, Config, ConfigError
-from jaxsense.config.frozen import FrozenDict
+from jaxsense.config.section import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.checks import require_function
 from jaxsense.config.mission import MAX_EPISODES
+from jaxsense.config.section import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy

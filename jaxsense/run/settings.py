@@ -17,7 +17,7 @@ from jaxsense.config import (
     parse_json,
     require_trust,
 )
-from jaxsense.config.checks import check_fields
+from jaxsense.config.section import check_fields
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
 

@@ -25,7 +25,7 @@ from jaxsense.config import (
     ConfigError,
     LidarConfig,
 )
-from jaxsense.config.checks import named_function
+from jaxsense.config.section import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, raycast

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from scipy import stats
 
 from jaxsense.config import ConfigError
-from jaxsense.config.checks import require_function
+from jaxsense.config.section import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.config.checks import require_32_bits
+from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Features, Key, Samples, pytree

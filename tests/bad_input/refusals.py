@@ -11,7 +11,6 @@ from jaxsense import PRESETS
 
 SMOKE = PRESETS["smoke"]
 NAN, INF = math.nan, math.inf
-HUGE = 10**5000
 SECTIONS = {
     field.name: getattr(SMOKE, field.name)
     for field in dataclasses.fields(SMOKE)
@@ -24,7 +23,6 @@ PARTS = {
     "team.travel": SMOKE.team.travel,
     "team.tours": SMOKE.team.tours,
     "mission.localisation": SMOKE.mission.localisation,
-    "mission.localisation.search": SMOKE.mission.localisation.search,
     "mission.communication": dataclasses.replace(SMOKE.mission.communication, own_maps=True),
 }
 NUMBERS = [
@@ -33,13 +31,6 @@ NUMBERS = [
     for field, kind in get_type_hints(type(section)).items()
     if kind in (int, float)
 ]
-TRACED = {
-    (name, f.name)
-    for name, section in PARTS.items()
-    for f in dataclasses.fields(section)
-    if f.type not in (int, float)
-}
-"""Fields that may be arrays, whose numbers nobody checks."""
 
 
 def check_message(text: str) -> None:

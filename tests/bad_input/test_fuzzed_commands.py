@@ -55,16 +55,19 @@ def status_of(parse, argv):
         raise AssertionError(argv) from error
 
 
+@pytest.mark.parametrize("lines", [200, pytest.param(LINES, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("command", PARSE)
-def test_any_command_line_is_read_or_refused_in_one_line(command, capsys, tmp_path, monkeypatch):
+def test_any_command_line_is_read_or_refused_in_one_line(
+    command, lines, capsys, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     draw = random.Random(f"{SEED} {command}")
     parse, base = PARSE[command]
-    known = [option for option in options._options(base) if option.name.startswith("-")]
+    known = [option for option in options.options_of(base) if option.name.startswith("-")]
     names = [option.name for option in known] or ["--seed"]
     names += [option.off for option in known if option.kind is bool]
     read = 0
-    for _ in range(LINES // len(PARSE)):
+    for _ in range(lines // len(PARSE)):
         argv = line_of(draw, names)
         status = status_of(parse, argv)
         told = capsys.readouterr()
@@ -77,5 +80,5 @@ def test_any_command_line_is_read_or_refused_in_one_line(command, capsys, tmp_pa
             assert told.err.endswith("\n"), argv
             assert told.err[:-1].isprintable(), argv
             assert len(told.err) < 1_000, argv
-    assert 10 < read < LINES
+    assert 0 < read < lines
     assert not any(tmp_path.iterdir())

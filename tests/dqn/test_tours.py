@@ -301,8 +301,9 @@ def of_sigmas(monkeypatch, after):
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
     of_sigmas(monkeypatch, [8.0, 3.0, 16.0])
     values = jax.jit(lambda: AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN))()
-    # 6, 16 and, an eighth of a turn and 12.73 - .9 m away, 60.9 s, each of which halves a value.
-    seconds = np.array([6, 16, math.pi / 4 + (9 * math.sqrt(2) - 0.9) / 0.2 + 1])
+    # .94 m, 2.94 m and, an eighth of a turn away, 11.77 m at .2 m/s, and looks of .7 s. Each second
+    # halves a value.
+    seconds = np.array([5.4, 15.4, math.pi / 4 / 1.2 + (9 * math.sqrt(2) - 0.96) / 0.2 + 0.7])
     expected = [*np.array([8.0, 3.0, 16.0]) * 0.5**seconds, 0.0]
     np.testing.assert_allclose(values, expected, rtol=1e-4)
 
