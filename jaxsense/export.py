@@ -22,8 +22,8 @@ import numpy as np
 from jax import export
 
 from jaxsense.config import MAX_BEARING, POI_HEIGHT, Config, ConfigError, Search
-from jaxsense.config.section import check_fields
 from jaxsense.config.options import Name
+from jaxsense.config.section import check_fields
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team

@@ -57,8 +57,8 @@ class LocalisationConfig(Section, place="mission.localisation"):
     grow with the square root of the distance."""
     search: tuple[float, float] = limited((0.0, 0.0), at_least=0, at_most=30)
     """Largest errors, in metres and degrees, for which robots search their scans for the PoI, for
-    example three times `error`: the detector judges all windows and distances that they could explain,
-    and a robot keeps a distance of at least `viewpoint.min_distance` plus the first number."""
+    example three times `error`: the detector judges all windows and distances that they could
+    explain, and a robot keeps at least `viewpoint.min_distance` plus the first number away."""
 
     def check(self) -> None:
         """Checks the limits of the errors of positions; raises `ConfigError`."""

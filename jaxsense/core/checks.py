@@ -1,6 +1,7 @@
-"""Checks of functions' arguments, in the form of `ConfigError`: `name = value: what is right`.
+"""Checks at public doors, in the form of `ConfigError`: `name = value: what is right`.
 
-Traced values are unknown: their checks pass and cost nothing.
+All raise `ValueError`, which names the argument. Traced values are unknown: only their shapes and
+types are checked.
 """
 
 import dataclasses
@@ -24,22 +25,13 @@ T = TypeVar("T")
 
 _MOST_SHOWN = 80  # characters of a value
 _ARRAYS = jax.Array | np.ndarray | np.generic | float | int
+_Shape = Sequence[int | EllipsisType | None]
 
 
 def require(
     name: str, value: object, is_right: Callable[[np.ndarray], np.ndarray], expected: str
 ) -> None:
-    """Checks every number of an array.
-
-    Args:
-      name: name of the argument.
-      value: the array, or anything that NumPy can convert to one.
-      is_right: `array -> bool array`, which of its numbers are right.
-      expected: what would be right.
-
-    Raises:
-      ValueError: names the first wrong number.
-    """
+    """All numbers of an array are right, by a function from arrays to bools."""
     if isinstance(value, Tracer):
         return
     values = np.asarray(value)
@@ -57,59 +49,25 @@ def _shown(value: object) -> str:
 
 
 def require_positive(name: str, value: object) -> None:
-    """Checks that all numbers are finite and greater than 0.
-
-    Args:
-      name: name of the argument.
-      value: an array.
-
-    Raises:
-      ValueError: names the first wrong number.
-    """
+    """All numbers are finite and greater than 0."""
     require(name, value, lambda x: np.isfinite(x) & (x > 0), "must be greater than 0")
 
 
 def require_finite(name: str, value: object, expected: str = "must be finite") -> None:
-    """Checks that all numbers are finite.
-
-    Args:
-      name: name of the argument.
-      value: an array.
-      expected: what would be right.
-
-    Raises:
-      ValueError: names the first wrong number.
-    """
+    """All numbers are finite."""
     require(name, value, np.isfinite, expected)
 
 
 def require_probabilities(name: str, value: object) -> None:
-    """Checks that all numbers are within 0 and 1, and that they sum to 1.
-
-    Args:
-      name: name of the argument.
-      value: `[..., C]` array.
-
-    Raises:
-      ValueError: names the first wrong number, or the first wrong sum.
-    """
+    """All numbers of `[..., C]` are within 0 and 1, and sum to 1 over C."""
     require(name, value, lambda x: (x >= 0) & (x <= 1), "must be probabilities, within 0 and 1")
     if not isinstance(value, Tracer):
         total = np.sum(np.asarray(value), axis=-1)
         require(f"sum of {name}", total, lambda x: np.abs(x - 1) < 1e-3, "must be 1")
 
 
-def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType | None]) -> None:
-    """Checks the shape of an array, also of a traced one.
-
-    Args:
-      name: name of the argument.
-      value: the array, or a number if it may have no axes.
-      shape: its sizes; None for an axis of any size, `...` at either end for any axes.
-
-    Raises:
-      ValueError: names the shape; if only leading axes are too many, also `jax.vmap`.
-    """
+def require_shape(name: str, value: object, shape: _Shape) -> None:
+    """An array has a shape: None for an axis of any size, `...` at either end for any axes."""
     if not isinstance(value, _ARRAYS):
         raise ValueError(f"{name} = {_shown(value)}: must be an array of shape {_text(shape)}")
     if not _has(value, shape):
@@ -118,7 +76,7 @@ def require_shape(name: str, value: object, shape: Sequence[int | EllipsisType |
         raise ValueError(f"{name} has the shape {np.shape(value)}: must be {_text(shape)}{advice}")
 
 
-def _has(value: object, shape: Sequence[int | EllipsisType | None]) -> bool:
+def _has(value: object, shape: _Shape) -> bool:
     try:
         chex.assert_shape(value, tuple(shape))
     except AssertionError:
@@ -126,20 +84,13 @@ def _has(value: object, shape: Sequence[int | EllipsisType | None]) -> bool:
     return True
 
 
-def _text(shape: Sequence[object]) -> str:
+def _text(shape: _Shape) -> str:
     words = ["any" if axis is None else "..." if axis is ... else str(axis) for axis in shape]
     return f"({', '.join(words)}{',' * (len(words) == 1)})"
 
 
 def require_key(key: object) -> None:
-    """Checks that a value is one random key, also a traced one.
-
-    Args:
-      key: from `jax.random.key`, or of the older form of `jax.random.PRNGKey`.
-
-    Raises:
-      ValueError: if it is something else, such as a seed or several keys.
-    """
+    """A value is one random key, of `jax.random.key` or of the older `jax.random.PRNGKey`."""
     expected = "must be one key, as from jax.random.key"
     if not isinstance(key, jax.Array | np.ndarray):
         raise ValueError(f"key = {_shown(key)}: {expected}(0)")
@@ -152,16 +103,7 @@ def require_key(key: object) -> None:
 
 
 def require_index(name: str, value: object, number: int) -> None:
-    """Checks that all numbers are indices of a sequence.
-
-    Args:
-      name: name of the argument.
-      value: an array.
-      number: length of the sequence.
-
-    Raises:
-      ValueError: unless all are whole and from 0 to `number - 1`.
-    """
+    """All numbers are indices of a sequence of some length."""
     expected = f"must be a whole number from 0 to {number - 1}"
     dtype = jnp.result_type(value)
     if not jnp.issubdtype(dtype, jnp.integer):
@@ -170,15 +112,7 @@ def require_index(name: str, value: object, number: int) -> None:
 
 
 def require_modality(modality: object, modalities: Sequence[str]) -> None:
-    """Checks that a modality is an index.
-
-    Args:
-      modality: the index.
-      modalities: names of the modalities.
-
-    Raises:
-      ValueError: lists the indices with their names.
-    """
+    """A modality is an index; the error lists the indices with their names."""
     try:
         require_index("modality", modality, len(modalities))
     except (TypeError, ValueError):
@@ -187,44 +121,23 @@ def require_modality(modality: object, modalities: Sequence[str]) -> None:
 
 
 def require_number(name: str, value: object) -> None:
-    """Checks that a value is one whole number greater than 0.
-
-    Args:
-      name: name of the argument.
-      value: the value.
-
-    Raises:
-      ValueError: if it is something else.
-    """
+    """A value is one whole number greater than 0."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name} = {_shown(value)}: must be a whole number greater than 0")
 
 
 def require_type(name: str, value: object, kind: type, source: str) -> None:
-    """Checks that a value is of a class.
-
-    Args:
-      name: name of the argument.
-      value: the value.
-      kind: the class.
-      source: where such values come from.
-
-    Raises:
-      ValueError: if it is of another.
-    """
+    """A value is of a class; `source` says where such values come from."""
     if not isinstance(value, kind):
-        expected = f"must be {kind.__name__}, {source}"
-        raise ValueError(f"{name} = {_shown(value)}: {expected}")
+        raise ValueError(f"{name} = {_shown(value)}: must be {kind.__name__}, {source}")
 
 
 def typed(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorator of a public function: arguments must be of the classes that annotate them.
+    """Decorator: arguments are of the dataclasses and protocols that annotate them, keys are one.
 
-    Checks dataclasses, members of protocols, and `key`; raises `ValueError` for something else.
+    Checks dataclasses, members of protocols, and `key`.
     """
-    hints: dict[str, type] = {
-        n: kind for n, kind in get_type_hints(function).items() if _is_own(kind)
-    }
+    hints: dict[str, type] = {n: k for n, k in get_type_hints(function).items() if _is_own(k)}
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -249,16 +162,7 @@ def _is_own(kind: object) -> bool:
 
 
 def require_belief(name: str, belief: Belief, size: int | None = None) -> None:
-    """Checks that a belief is of one PoI, finite and wide.
-
-    Args:
-      name: name of the argument.
-      belief: the belief.
-      size: its number of dimensions, D; any by default.
-
-    Raises:
-      ValueError: if it is no `Belief`, or one of another shape, not finite or of no width.
-    """
+    """A belief is of one PoI, finite and wide, with `size` dimensions or any."""
     require_type(name, belief, Belief, "with mean and std")
     require_shape(f"{name}.mean", belief.mean, (size,))
     require_shape(f"{name}.std", belief.std, np.shape(belief.mean))
@@ -267,17 +171,7 @@ def require_belief(name: str, belief: Belief, size: int | None = None) -> None:
 
 
 def require_members(name: str, value: object, protocol: type, needed: Sequence[str] = ()) -> None:
-    """Checks that a value has members of a protocol, whatever they are.
-
-    Args:
-      name: name of the argument.
-      value: the value.
-      protocol: with the members.
-      needed: names of those to check; all by default.
-
-    Raises:
-      ValueError: lists those that are missing.
-    """
+    """A value has the members of a protocol that are named, or all."""
     if isinstance(value, type):
         raise ValueError(f"{name} = {value.__name__}: must be a {protocol.__name__}, not its class")
     members = needed or [member for member in vars(protocol) if not member.startswith("_")]
@@ -288,30 +182,13 @@ def require_members(name: str, value: object, protocol: type, needed: Sequence[s
 
 
 def require_tuple(name: str, value: object) -> None:
-    """Checks that a value is a tuple.
-
-    Args:
-      name: name of the argument.
-      value: the value.
-
-    Raises:
-      ValueError: if it is something else; JAX cannot hash a list.
-    """
+    """A value is a tuple: JAX cannot hash a list."""
     if not isinstance(value, tuple):
         raise ValueError(f"{name} = {_shown(value)}: must be a tuple")
 
 
 def require_one_each(name: str, values: object, modalities: Sequence[str]) -> None:
-    """Checks that each modality has one value.
-
-    Args:
-      name: name of the argument.
-      values: the values.
-      modalities: names of the modalities.
-
-    Raises:
-      ValueError: if there are more values, or fewer.
-    """
+    """Each modality has one value."""
     expected = f"{len(modalities)}, one for each of {tuple(modalities)}"
     if not isinstance(values, Sequence | jax.Array | np.ndarray) or isinstance(values, str):
         raise ValueError(f"{name} = {_shown(values)}: must hold {expected}")
@@ -322,16 +199,7 @@ def require_one_each(name: str, values: object, modalities: Sequence[str]) -> No
 def require_features(
     features: Sequence[ArrayLike | None], modalities: Sequence[str], sizes: Sequence[int]
 ) -> None:
-    """Checks that each modality has finite features or None, and one or more have some.
-
-    Args:
-      features: for each modality `[D_m]`, or None.
-      modalities: names of the modalities.
-      sizes: D_m of each.
-
-    Raises:
-      ValueError: names the first modality with something else.
-    """
+    """Each modality has finite `[D_m]` features or None, and one or more have some."""
     require_one_each("features", features, modalities)
     if all(feature is None for feature in features):
         raise ValueError(f"features = {features}: must hold one modality or more")
@@ -344,16 +212,7 @@ def require_features(
 def require_bank(
     bank: Sequence[ArrayLike], modalities: Sequence[str], sizes: Sequence[int]
 ) -> None:
-    """Checks that each modality has finite features of looks at the same classes, one or more.
-
-    Args:
-      bank: for each modality `[C, S, D_m]` features.
-      modalities: names of the modalities.
-      sizes: D_m of each.
-
-    Raises:
-      ValueError: names the first modality with something else.
-    """
+    """Each modality has finite `[C, S, D_m]` features of looks at the same classes."""
     require_one_each("bank", bank, modalities)
     for name, size, features in zip(modalities, sizes, bank, strict=True):
         of_modality, shape = f"bank of {name}", np.shape(features)

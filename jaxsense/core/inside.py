@@ -10,30 +10,17 @@ LARGEST = 2**24
 
 
 def place(path: Path, directory: Path) -> Path:
-    """Returns a path that does not lead out of a directory.
-
-    Args:
-      path: of a file or directory, which need not exist.
-      directory: may be a link itself.
-
-    Raises:
-      OSError: if the path, or a link on its way, leads out.
-    """
+    """Returns a path; raises `OSError` if it, or a link on its way, leads out of a directory."""
     if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(directory)):
         raise OSError(errno.ELOOP, "Leads out of its directory", str(path))
     return path
 
 
 def read(path: Path, most: int = LARGEST) -> bytes:
-    """Reads a regular file.
-
-    Args:
-      path: of the file.
-      most: largest size, in bytes.
+    """Reads a file of at most so many bytes.
 
     Raises:
-      OSError: if there is no such file, if it is a link out of its directory, if it is not a
-        regular file, or if it is larger.
+      OSError: if there is none, if it is larger, not regular, or a link out of its directory.
     """
     found = place(path, path.parent).stat()
     if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
@@ -44,11 +31,7 @@ def read(path: Path, most: int = LARGEST) -> bytes:
 
 
 def matching(directory: Path, pattern: str) -> list[Path]:
-    """Files in a directory, or in one of its directories, in the order of their names.
-
-    Args:
-      directory: see `place`.
-      pattern: that they match; names that cannot be printed do not.
+    """Files of a directory that match a pattern and can be printed, in the order of their names.
 
     Raises:
       OSError: if they lie elsewhere, or are together larger than `LARGEST`.

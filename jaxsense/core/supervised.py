@@ -36,25 +36,11 @@ class Problem(Protocol, Generic[D]):
         ...
 
     def draw(self, key: Key, number: int) -> D:
-        """Draws the random values of all steps together, much cheaper than step by step.
-
-        Args:
-          key: random key.
-          number: of steps; static.
-
-        Returns:
-          `[number, ...]` arrays.
-        """
+        """`[number, ...]` random values of all steps, much cheaper together than step by step."""
         ...
 
     def loss(self, params: Params, drawn: D, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Loss of one step.
-
-        Args:
-          params: of the network.
-          drawn: for this step, a row of what `draw` returns.
-          step: `[]` int32, counted from the start of the fit.
-        """
+        """Loss of one step of the whole fit, with a row of what `draw` returns."""
         ...
 
 
@@ -63,8 +49,6 @@ class FitState:
     """State of a fit between two chunks of steps.
 
     Attributes:
-      params: of the network.
-      optimiser: state of the optimiser.
       step: `[]` int32 number of gradient steps so far.
       loss: `[]` mean loss of the last chunk; infinite before the first.
     """
@@ -84,30 +68,18 @@ def _adam(config: FitConfig) -> optax.GradientTransformation:
 
 
 def start(params: Params, config: FitConfig) -> FitState:
-    """State before the first step.
-
-    Args:
-      params: initial parameters.
-      config: settings of the fit.
-    """
+    """State before the first step."""
     return FitState(params, _adam(config).init(params), jnp.int32(0), jnp.float32(jnp.inf))
 
 
 def fit(
     key: Key, state: FitState, problem: Problem[D], number: int
 ) -> tuple[FitState, Float[Array, "{number}"]]:
-    """Takes gradient steps, at most until the end of the whole fit.
-
-    Args:
-      key: random key of what the steps draw.
-      state: from `start` or an earlier call.
-      problem: what to minimise.
-      number: of steps; static.
+    """Takes a static number of gradient steps, at most until the end of the whole fit.
 
     Returns:
-      The state after the last step and the `[number]` losses, of which those beyond the end of the
-      fit have no meaning. Non-finite values raise no error: the last loss of the fit is NaN if the
-      parameters after it are not finite.
+      The state after the last step and the losses, without meaning beyond the end of the fit. The
+      last one of the fit is NaN if the parameters after it are not finite.
     """
     optimiser, total = _adam(problem.config), problem.config.steps
     drawn = problem.draw(key, number)

@@ -60,16 +60,11 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def register(cls: type, leaves: Sequence[str], static: Sequence[str]) -> None:
-    """Makes a dataclass a pytree: its class is part of the tree definition.
+    """Makes a dataclass a pytree with some leaves; other fields are hashable.
 
-    `jax.tree_util.register_dataclass` would not do: two of its classes with equal fields have equal
-    tree definitions, and jax 0.10 then runs one's compiled program with the other. Values of a
-    pytree are not checked when JAX rebuilds it, because they may be placeholders.
-
-    Args:
-      cls: the dataclass.
-      leaves: names of the fields that hold pytrees.
-      static: names of the other fields; hashable.
+    The class is part of the tree definition: two classes of `jax.tree_util.register_dataclass` with
+    equal fields have equal ones, and jax 0.10 then runs one's compiled program with the other.
+    Nothing is checked when JAX rebuilds a pytree, because its values may be placeholders.
     """
     keys = [jax.tree_util.GetAttrKey(name) for name in leaves]
 
@@ -146,14 +141,14 @@ class Fusion(Protocol):
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look.
+        """Belief `[D]` after one more look by a modality, a static index.
 
         Args:
-          belief: `[D]` before the look.
-          seen: `[M]` bool, which modalities have looked before.
-          features: `[D_m]` probabilities of the labels.
+          belief: before the look.
+          seen: which modalities have looked before.
+          features: probabilities of the labels.
           modality: index of the sensor; static.
-          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+          weight: share of the look that is new evidence, see `vae.Novelty`.
         """
         ...
 
@@ -195,12 +190,9 @@ def is_static(index: Index) -> bool:
 
 
 def call(function: Callable[[int], T], index: Index, number: int) -> T:
-    """Calls a function of a static index with any index.
+    """Calls a function of a static index with any index below `number`.
 
-    Args:
-      function: returns the same shapes for every index.
-      index: of the call; the program switches between all indices if it is an array.
-      number: of indices.
+    The program switches between all indices if it is an array; all have results of one shape.
     """
     if is_static(index):
         return function(int(index))
@@ -208,14 +200,6 @@ def call(function: Callable[[int], T], index: Index, number: int) -> T:
 
 
 def others(rows: Shaped[Array, "R ..."], index: Index) -> Shaped[Array, "R-1 ..."]:
-    """All rows except one, starting with the row after it.
-
-    Args:
-      rows: `[R, ...]`.
-      index: of the row to leave out.
-
-    Returns:
-      `[R - 1, ...]`.
-    """
+    """All rows except one, starting with the row after it."""
     number = len(rows)
     return rows[(index + 1 + jnp.arange(number - 1)) % number]

@@ -35,12 +35,6 @@ def parse(
       argv: the command line without the program.
       default: values of missing options; those of the class by default.
       common: options that `--help` shows, in this order; all by default.
-
-    Returns:
-      The options.
-
-    Raises:
-      SystemExit: with status 0 after the help, with status 2 after an error.
     """
     base = arguments if default is None else default
     if {"-h", "--help", "--help-all"} & set(argv):
@@ -54,25 +48,12 @@ def parse(
 
 
 def warn(program: str, message: str) -> None:
-    """Prints a line about a program to standard error.
-
-    Args:
-      program: module that runs.
-      message: the rest of the line.
-    """
+    """Prints a line about a program, a module that runs, to standard error."""
     complain(f"{options.command(program).removeprefix('python -m ')}: {message}")
 
 
 def fail(program: str, message: str) -> NoReturn:
-    """Ends a program with one line about an error that the user can correct.
-
-    Args:
-      program: module that runs.
-      message: the error.
-
-    Raises:
-      SystemExit: with status 2.
-    """
+    """Ends a program with status 2 and one line about an error that the user can correct."""
     warn(program, " ".join(message.splitlines()))
     sys.exit(2)
 
@@ -83,15 +64,7 @@ def reason(error: OSError) -> str:
 
 
 def require_directory(field: str, path: Path | None) -> None:
-    """Checks that a path is a directory or may become one.
-
-    Args:
-      field: name of the option, for the error.
-      path: the path; None is allowed.
-
-    Raises:
-      ConfigError: if it is something else or cannot be used.
-    """
+    """Raises a `ConfigError` unless a path is None, a directory, or may become one."""
     try:
         is_other = path is not None and path.exists() and not path.is_dir()
     except OSError as error:
@@ -104,12 +77,6 @@ def keep_programs(
     program: str, directory: Path | None, config: Config, *, has_own_code: bool = False
 ) -> Kept | None:
     """Opens the directory of compiled programs.
-
-    Args:
-      program: module that runs.
-      directory: where to keep them, if anywhere.
-      config: all settings.
-      has_own_code: whether missions play custom policies.
 
     Returns:
       The programs with these settings; None with custom sensors or policies, whose code may

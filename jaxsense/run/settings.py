@@ -26,14 +26,7 @@ Json: TypeAlias = dict[str, object]
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Everything that determines a run's results, on the same devices and versions.
-
-    Attributes:
-      preset: name of the preset that the settings started from.
-      seed: of all randomness; the first one if there are several.
-      config: all settings.
-      num_seeds: number of seeds to train.
-    """
+    """Everything that determines a run's results, on the same devices and versions."""
 
     preset: str
     seed: int
@@ -72,11 +65,7 @@ def as_json(settings: Settings) -> Json:
 
 
 def began(path: Path) -> float:
-    """When a run began, in seconds since 1970, which a copy of its directory does not change.
-
-    Args:
-      path: its directory, with a `config.json`. If that does not tell, the time of its last change.
-    """
+    """When a run began, in seconds since 1970; else when its `config.json` last changed."""
     file = path / "config.json"
     try:
         return datetime.fromisoformat(str(_read_config(file, "run", path)["began"])).timestamp()
@@ -85,32 +74,17 @@ def began(path: Path) -> float:
 
 
 def read_settings(file: Path, trust: bool = False) -> Settings:
-    """Reads the settings in a `config.json`.
-
-    Missing ones come from the preset that it names, `default` if it names none, with seed 0.
-
-    Args:
-      file: the file.
-      trust: whether it may name custom sensors, whose code runs when they are made.
+    """Reads a `config.json`; missing settings come from the preset that it names, or `default`.
 
     Raises:
       ConfigError: if the file cannot be read, a field is unknown or wrong, or if it names custom
-        sensors without trust.
+        sensors, whose code runs when they are made, without trust.
     """
     return _settings_of(_read_config(file, "config", file), trust)
 
 
 def resumable(path: Path, trust: bool = False) -> Settings:
-    """Reads the settings of a stopped run.
-
-    Args:
-      path: the directory.
-      trust: whether `config.json` may name custom sensors, whose code runs.
-
-    Raises:
-      ConfigError: if there is no run, if another version wrote it, if it is finished, or if it
-        names custom sensors without trust.
-    """
+    """Reads the settings of a stopped run; raises `ConfigError` as `of_run`, or if finished."""
     settings = of_run(path, trust, "resume")
     if os.path.lexists(path / "summary.json"):
         raise ConfigError("resume", str(path), "is finished; must be a stopped run")
@@ -118,16 +92,11 @@ def resumable(path: Path, trust: bool = False) -> Settings:
 
 
 def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
-    """Reads the settings of a run whose models are wanted.
-
-    Args:
-      path: the directory.
-      trust: whether `config.json` may name custom sensors, whose code runs.
-      field: name of the option, for errors.
+    """Reads the settings of a run whose models are wanted; errors name it as an option `field`.
 
     Raises:
-      ConfigError: if there is no run, if another version wrote it, or if it names custom sensors
-        without trust.
+      ConfigError: if there is no run, if another version wrote it, if its `config.json` has changed
+        since, or if it names custom sensors without trust.
     """
     content = _read_config(path / "config.json", field, path)
     _check_origin(content, field, path)
@@ -135,10 +104,7 @@ def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
 
 
 def _read_config(file: Path, field: str, path: Path) -> Json:
-    """The content of a `config.json`.
-
-    Raises `ConfigError` about `field = path`, which is the file or its run's directory.
-    """
+    """The content of a `config.json`; raises `ConfigError` about `field = path`."""
     try:
         # A file that the user names may be a link, that of a run may not lead out of it.
         real = Path(os.path.realpath(file)) if path == file else file

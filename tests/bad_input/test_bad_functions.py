@@ -15,7 +15,6 @@ from jaxsense import Belief, Transition, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.dqn import replay
 from jaxsense.interfaces import common
 from jaxsense.mission import roadmap
-from jaxsense.run import batches
 from jaxsense.vae import filter
 
 # Settings whose models have other shapes.

@@ -56,9 +56,7 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
 def test_every_step_equals_the_mdps(robots):
     mdp = robots.mdp
     mdp_step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
-    observe = jax.jit(
-        lambda s, r: team_mdp.observation(mdp.travel, s.map.belief, s.team, r, 2)
-    )
+    observe = jax.jit(lambda s, r: team_mdp.observation(mdp.travel, s.map.belief, s.team, r, 2))
     state = expected = reset(jax.random.key(3), robots)
     turns, looks = [], 0
     for i in range(11):
