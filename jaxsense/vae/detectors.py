@@ -24,6 +24,8 @@ _MAX_LOST = 0.01  # share of the looks at PoIs
 _MAX_PASSED = 0.002  # share of the looks at nothing, if few looks at PoIs are lost for it
 _FACTORS = np.geomspace(1 / 16, 16, 513, dtype=np.float32)  # on logits, that are tried
 _BINS = 15
+_IS_WHOLE = "must be finite; leave out what was not recorded"
+_Rows = tuple[Int[Array, "... B"], Int[Array, "... C"]]
 
 
 class Detector(Protocol):
@@ -44,10 +46,8 @@ class Detector(Protocol):
         """Minimum log-odds that the PoI is there, for an answer with a label."""
         ...
 
-    def logits(
-        self, window: Float[Array, " F"], distance: Float[Array, ""]
-    ) -> Float[Array, " D_m+1"]:
-        """Of the labels and, last, log-odds that the PoI is there, see `log_probabilities`.
+    def logits(self, window: Float[Array, " F"], distance: Float[Array, ""]) -> Float[Array, " O"]:
+        """`[D_m + 1]` of the labels and, last, log-odds that the PoI is there.
 
         Args:
           window: readings around the PoI's bearing, see `sim.windows.as_window`.
@@ -85,8 +85,8 @@ class Looks:
     distances: Float[Array, " S"]
 
 
-def log_probabilities(logits: Float[Array, "D_m+1 *B"]) -> Float[Array, "D_m+1 *B"]:
-    """Of the labels and, last, of "nothing there", if half of all looks show nothing.
+def log_probabilities(logits: Float[Array, "O *B"]) -> Float[Array, "O *B"]:
+    """`[D_m + 1]` of the labels and, last, of "nothing there", if half of all looks show nothing.
 
     A hierarchical softmax (Morin and Bengio 2005): the log-odds that the PoI is there do not depend
     on its label, and each level has a temperature of its own.
@@ -189,7 +189,7 @@ class Classifier:
 
     def logits(
         self, window: Float[Array, "F *B"], distance: Float[Array, "*B"]
-    ) -> Float[Array, "D_m+1 *B"]:
+    ) -> Float[Array, "O *B"]:
         """See `Detector.logits`; also for looks in columns."""
         read = [(window - self.offset.reshape(-1, *[1] * distance.ndim)) / self.scale]
         if self.measures_distance:
@@ -198,7 +198,7 @@ class Classifier:
         read.append(jnp.stack([distance, 1 / distance]))
         return networks.apply(self.network, self.params, jnp.concatenate(read))
 
-    def of(self, looks: Looks) -> Float[Array, "D_m+1 S"]:
+    def of(self, looks: Looks) -> Float[Array, "O S"]:
         """Logits of many looks."""
         return self.logits(looks.windows.T, looks.distances)
 
@@ -239,7 +239,7 @@ class Fitting:
     labels: Int[Array, " S"]
     nothing: Looks
 
-    def draw(self, key: Key, number: int) -> tuple[Int[Array, "_ B"], Int[Array, "_ B/2"]]:
+    def draw(self, key: Key, number: int) -> _Rows:
         """Rows of the looks at PoIs, and of those at nothing, see `Problem.draw`."""
         shown_key, nothing_key = jax.random.split(key)
         batch = self.config.batch
@@ -247,9 +247,7 @@ class Fitting:
         shape = number, -(-batch // 2)
         return shown, jax.random.randint(nothing_key, shape, 0, len(self.nothing.distances))
 
-    def loss(
-        self, params: Params, drawn: tuple[Int[Array, " B"], Int[Array, " B/2"]], step: Array
-    ) -> Float[Array, ""]:
+    def loss(self, params: Params, drawn: _Rows, step: Array) -> Float[Array, ""]:
         """Mean cross-entropy of looks at PoIs, plus that of looks at nothing."""
         del step
         detector, (shown, nothing) = dataclasses.replace(self.detector, params=params), drawn
@@ -287,7 +285,7 @@ def calibrate(detector: Classifier, shown: Looks, labels: Int[Array, " S"]) -> C
     return _scaled(detector, jnp.full(detector.num_labels + 1, best).at[-1].set(1.0))
 
 
-def _scaled(detector: Classifier, factors: Float[Array, " D_m+1"]) -> Classifier:
+def _scaled(detector: Classifier, factors: Float[Array, " O"]) -> Classifier:
     """The detector with scaled outputs of its network."""
     params = networks.scale_last(detector.network, detector.params, factors)
     return dataclasses.replace(detector, params=params)
@@ -332,7 +330,7 @@ def retrain(
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
     shown, labels = jax.tree.map(jnp.asarray, (shown, labels))
     checks.require_shape("windows", shown.windows, (None, detector.window_size))
-    checks.require_finite("windows", shown.windows, "must be finite; leave out what has gaps")
+    checks.require_finite("windows", shown.windows, _IS_WHOLE)
     checks.require_shape("labels", labels, (len(shown.windows),))
     checks.require_shape("distances", shown.distances, labels.shape)
     checks.require_index("labels", labels, detector.num_labels)

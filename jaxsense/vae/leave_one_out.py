@@ -240,9 +240,7 @@ class Encoder:
         """See `Detector`."""
         return self.presence.threshold
 
-    def logits(
-        self, window: Float[Array, " F"], distance: Float[Array, ""]
-    ) -> Float[Array, " D_m+1"]:
+    def logits(self, window: Float[Array, " F"], distance: Float[Array, ""]) -> Float[Array, " O"]:
         """See `Detector.logits`; labels are read from the posterior of the look."""
         odds = self.presence.logits(window, distance)[-1:]
         return jnp.concatenate([self.sharpness * self._of_labels(window), odds])
