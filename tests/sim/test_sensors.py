@@ -68,6 +68,13 @@ def test_lidar_rays():
     np.testing.assert_allclose(np.diff(angles), 240 / 682, atol=1e-3)
 
 
+def test_a_single_ray_points_ahead():
+    one = sensors.lidar(LidarConfig(num_beams=1, window=1))
+    np.testing.assert_array_equal(one.angles, [0.0])
+    assert one.centre(jnp.float32(0.0)) == 0.0
+    assert one.steps == (0.0, 0.0)
+
+
 def test_camera_rays_are_those_of_a_pinhole_from_left_to_right():
     angles = sensors.camera(CameraConfig()).angles
     assert angles.shape == (640,)
@@ -104,6 +111,10 @@ def test_noise_has_the_configured_standard_deviation():
     np.testing.assert_allclose(pixels.std(axis=0), 0.05, atol=1e-3)
     np.testing.assert_allclose(pixels.mean(axis=0), 0.25, atol=1.5e-3)
     np.testing.assert_allclose(np.corrcoef(pixels.T), np.eye(3), atol=0.03)
+    # Within full scale, whatever the noise.
+    noisy = sensors.camera(CameraConfig(pixel_noise=0.5))
+    pixels = np.array(noisy.read(jax.random.key(1), many, WHITE, LIGHT))
+    assert (pixels.min(), pixels.max()) == (0.0, 1.0)
 
 
 def test_ranges_stop_at_the_shortest_and_the_longest():
