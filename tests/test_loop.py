@@ -349,15 +349,3 @@ def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
     assert saved(tmp_path, 9)[:2] == (1, 1)
     monitor.begin(lambda *_: None)  # the next seed
     monitor.check_stop()
-
-
-def test_nan_on_a_full_disk_tells_of_both(monkeypatch, tmp_path):
-    def full(*_):
-        raise OSError(28, "No space left on device", "jmvae.msgpack")
-
-    def run(chunk):
-        raise StageError("jmvae: loss = nan at step 1 of 4")
-
-    monkeypatch.setattr(Checkpoints, "save_unfinished", full)
-    with pytest.raises(StageError, match=r"nan at step 1 of 4; .* No space left on device"):
-        go_on(tmp_path, 4, run)

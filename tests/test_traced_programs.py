@@ -1,48 +1,15 @@
 """What changes a program and what does not: numbers of the settings are none of its constants."""
 
 import dataclasses
-import json
 import re
 
 import jax
 import pytest
-from smoke import SMOKE
 
-from jaxsense import train
 from jaxsense.config import PRESETS
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs
-
-NUMBERS = {
-    "detector.learning-rate": "0.001",
-    "jmvae.alpha": "0.3",
-    "jmvae.annealing": "0.4",
-    "jmvae.reconstruction-weights": "8 9",
-    "mdp.min-increase": "0.1",
-    "mdp.max-steps": "15",
-    "dqn.discount": "0.7",
-    "dqn.target-period": "7",
-    "lidar.range-noise": "0.02",
-    "camera.pixel-noise": "0.01",
-    "viewpoint.bearing-error": "2",
-    "mission.equal-values": "0.2",
-    "mission.time-limit": "2",
-}
-
-
-@pytest.mark.slow  # two runs and a cache; `test_traced_settings` is the fast companion
-def test_other_numbers_need_no_other_program(tmp_path):
-    options = [word for name, text in NUMBERS.items() for word in (f"--{name}", *text.split())]
-    summaries, programs_of = [], []
-    for name, some in (("first", []), ("second", options)):
-        out = tmp_path / name
-        train.main([*SMOKE, "--cache", str(tmp_path / "cache"), *some, "--out", str(out)])
-        summaries.append(json.loads((out / "summary.json").read_text()))
-        programs_of.append({path.name for path in (tmp_path / "cache" / "traced").iterdir()})
-    assert programs_of[0] == programs_of[1]
-    for block in ("detectors", "jmvae", "dqn", "mission"):
-        assert summaries[0][block] != summaries[1][block]
 
 
 @pytest.mark.slow  # traces everything twice

@@ -56,16 +56,13 @@ class Program:
 
         Args:
           function: what to compile.
-          *args: arguments or their shapes, for example what another program's `compile` returns.
+          *args: arguments or their shapes.
           workers: share the rows of the arguments.
           whole: positions of arguments that every worker gets undivided.
           **options: see `devices.compiler_options`.
 
         Returns:
-          Shapes and dtypes of the results.
-
-        Raises:
-          CancelledError: if the run is over.
+          Shapes of the results.
         """
         if self._compiler.is_closed:
             raise CancelledError

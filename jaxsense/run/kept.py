@@ -52,19 +52,14 @@ class Traced(NamedTuple):
 
 
 class Kept:
-    """Cache of traced programs.
-
-    Attributes:
-      path: its directory.
-    """
+    """Cache of traced programs in the directory `path`."""
 
     def __init__(self, directory: Path, *settings: object):
         """Opens the cache, and removes the least recently used programs.
 
         Args:
           directory: holds the cache, in `traced`.
-          *settings: everything outside jaxsense's source that programs close over, as values whose
-            `repr` tells them apart.
+          *settings: what programs close over outside jaxsense's source; their `repr` differs.
 
         Raises:
           OSError: if the directory cannot be made, or if other users may write to it: loading a
@@ -81,16 +76,9 @@ class Kept:
             files.remove_unfinished(self.path)
 
     def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
-        """Finds a cached program, or traces and caches it.
+        """Finds a cached program, or traces and caches it; None if it cannot be exported.
 
-        Args:
-          name: of the program.
-          function: what to trace.
-          args: its arguments or their shapes.
-
-        Returns:
-          The program; None if it cannot be exported. A line to standard error says why it cannot be
-          loaded, exported or cached.
+        A line to standard error says why it cannot be loaded, exported or cached.
         """
         shapes = repr(shapes_of(args)).encode()
         digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
@@ -142,9 +130,6 @@ def trace(function: Function, args: PyTree) -> Traced:
 
 def use_cache(directory: Path) -> None:
     """Makes JAX cache all compiled programs, also small ones, unless the user has set a cache.
-
-    Args:
-      directory: holds them, in `compiled`.
 
     Raises:
       OSError: if the directory cannot be made, or if other users may write to it.

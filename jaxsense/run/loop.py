@@ -26,12 +26,7 @@ _SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # 
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """The results of a training.
-
-    Attributes:
-      outputs: by the name of the stage, but of none that only passes it on.
-      curves: of every stage with steps: `[steps]` of each metric, and `seconds` of each chunk.
-    """
+    """Outputs of stages, and curves: `[steps]` of each metric, and `seconds` of each chunk."""
 
     outputs: dict[str, Output]
     curves: dict[str, Curves]
@@ -51,8 +46,8 @@ def train(
       config: all settings; its `Traced` fields are inputs of the programs.
       programs: of the stages.
       monitor: receives time and progress.
-      checkpoints: where to save, if anywhere; stages found there are not trained again. They must
-        come from the same key and settings.
+      checkpoints: where to save, if anywhere. Stages found there, which must come from the same key
+        and settings, are not trained again.
 
     Raises:
       StageError: if a loss, parameter or result is not finite; trainings under way are saved as
@@ -108,7 +103,7 @@ class _Loop:
         return Trained(outputs, self.curves)
 
     def wait_for_saving(self) -> None:
-        """Waits until all is saved, and raises the first error."""
+        """Raises the first error of saving."""
         for each in self.saving:
             each.result()
 
@@ -250,16 +245,13 @@ def run_chunks(
     Args:
       stage: with chunks.
       state: first state.
-      run: `(chunk, state) -> (state, metrics)`, deterministic.
+      run: `(chunk, state) -> (state, metrics)`. The state before a `StageError` is saved.
       monitor: asked whether to stop.
       checkpoints: where to save the training.
       whole: see `Checkpoints.load_unfinished`.
 
     Returns:
       The last state and the metrics of all chunks.
-
-    Raises:
-      StageError: from `run`; the state before the chunk is saved.
     """
     done, curves = 0, Curves()
     found = checkpoints.load_unfinished(stage.name, state, stage.chunks, whole)
@@ -269,11 +261,8 @@ def run_chunks(
     for chunk in range(done, stage.chunks):
         try:
             after, metrics = run(chunk, state)
-        except StageError as error:
-            try:
-                checkpoints.save_unfinished(stage.name, Unfinished(chunk, state, curves))
-            except OSError as lost:
-                raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
+        except StageError:
+            checkpoints.save_unfinished(stage.name, Unfinished(chunk, state, curves))
             raise
         state = after
         for name, values in metrics.items():

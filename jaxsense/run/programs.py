@@ -80,8 +80,8 @@ class Programs:
         Args:
           config: all settings.
           compiler: compiles the programs.
-          workers: threads or devices that share rows and missions.
-          trainings: number of trainings after whose last call a program is released; 0 for never.
+          workers: share rows and missions.
+          trainings: number after whose last call a program is released; 0 for never.
           policies: of missions, by name, in addition to `dqn.POLICIES`.
         """
         self.config, self.arena = config, make_world(config).arena

@@ -142,10 +142,7 @@ def restarts(
     untrained: Callable[..., tuple[Output, Params]],
     problem: Callable[..., Problem[Output]],
 ) -> list[Stage]:
-    """Makes the stages that train a JMVAE from different random parameters.
-
-    Each outputs the parameters and the `[]` mean loss of the last chunk; see `fit_stage`.
-    """
+    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk."""
 
     def trained(
         config: Config, model: Output, fit: FitState, **inputs: Output
