@@ -15,7 +15,7 @@ from benchmarks import ROWS
 from benchmarks.measure import Options, Row, reserve
 from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields, require
-from jaxsense.run import cli, devices
+from jaxsense.run import cli, devices, output
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
@@ -94,4 +94,4 @@ def _number(value: float) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    output.run(main)

@@ -14,7 +14,7 @@ from jaxsense import PRESETS, init, mission
 from jaxsense.config import Config
 from jaxsense.mission import MissionState
 from jaxsense.mission.rollout import rollout_batch
-from jaxsense.run import batches, devices
+from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.missions import Played, Player
@@ -23,7 +23,7 @@ from jaxsense.run.monitor import Monitor
 _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
-# On a CPU; so many that `evaluate` compiles faster programs, see `batches.runs_long`.
+# On a CPU; so many that `evaluate` compiles faster programs, see `ledger.runs_long`.
 _OF_CPU, _OF_CPU_OF_MANY = 5632, 1024
 PERIODS_BEFORE = 40
 """Control periods before what is measured under way: 4 s of missions that last 14 s."""
@@ -90,16 +90,14 @@ def _play(
     scenario, cases = mission.make_mission(config), {"naive": mission.cases(config)["naive"]}
 
     def side(compiler: Compiler, workers: Workers) -> Side:
-        batch = batches.batch_of(config, total, workers)
-        runs_long = batches.runs_long(config, total)
-        player = Player(scenario, compiler, batch, workers, runs_long)
+        player = Player(scenario, compiler, total, workers)
         player.wait()
 
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
         compile_s = compiler.monitor.stopwatch.timing()["stages"]["mission"]["compile_s"]
-        return Side(run, run().control_steps, batch, compile_s, workers.number)
+        return Side(run, run().control_steps, player.batch, compile_s, workers.number)
 
     with contextlib.ExitStack() as stack:
         ours, *theirs = (

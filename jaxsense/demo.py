@@ -71,12 +71,21 @@ def main(argv: list[str] | None = None) -> None:
             kept = cli.keep_programs(PROGRAM, arguments.cache, config)
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
                 played = _play(arguments, scenario, models, compiler)
-            block = summary.missions(
-                scenario, {name: each.metrics[name] for name, each in played.items()}
-            )
+            metrics = {name: each.metrics[name] for name, each in played.items()}
+            block = summary.missions(scenario, metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"
-            files.write(path, _page(arguments, scenario, models, played, table))
+            text = page.fill(
+                "demo.html.jinja",
+                preset=arguments.preset,
+                seed=arguments.seed,
+                other=next(name for name in PRETRAINED if name != arguments.preset),
+                films=[_films(scenario, models, played)],
+                averages=_AVERAGES,
+                table=table,
+                sentence=_sentence(arguments.policy),
+            )
+            files.write(path, text)
     except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -93,24 +102,18 @@ def _play(
     arguments: Arguments, scenario: mission.Mission, models: Models, compiler: Compiler
 ) -> dict[str, Played]:
     """A mission of each policy, in the same arena."""
-    player, key = missions.Player(scenario, compiler, batch=1), jax.random.key(arguments.seed)
+    player, key = missions.Player(scenario, compiler, total=1), jax.random.key(arguments.seed)
     cases = mission.cases(scenario.config, scenario.policies)
     names = dict.fromkeys((arguments.policy, _REFERENCE))
     return {name: player.play(key, models, {name: cases[name]}, episodes=1) for name in names}
 
 
-def _page(
-    arguments: Arguments,
-    scenario: mission.Mission,
-    models: Models,
-    played: dict[str, Played],
-    table: tables.Table,
-) -> str:
-    """The page, with the animations in it."""
+def _films(scenario: mission.Mission, models: Models, played: dict[str, Played]) -> dict[str, str]:
+    """Animations of the missions, which last equally long."""
     config, fields = scenario.config, scenario.fields_of_view
     recordings = {name: each.recording for name, each in played.items()}
     lasts = max(film.duration_of(config, each.end) for each in recordings.values())
-    films = {
+    return {
         name: page.drawing(
             film.draw(
                 config, each.records, each.end, models.fusion, fields, f"{name} policy", lasts
@@ -118,16 +121,6 @@ def _page(
         )
         for name, each in recordings.items()
     }
-    return page.fill(
-        "demo.html.jinja",
-        preset=arguments.preset,
-        seed=arguments.seed,
-        other=next(name for name in PRETRAINED if name != arguments.preset),
-        films=[films],
-        averages=_AVERAGES,
-        table=table,
-        sentence=_sentence(arguments.policy),
-    )
 
 
 def _sentence(policy: str) -> str:

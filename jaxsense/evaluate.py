@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import jax
+import numpy as np
 import rich.console
 import rich.table
 
@@ -17,8 +18,9 @@ from jaxsense.config import CONTROL_PERIOD, TIMESTEP, Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields, limited, require
-from jaxsense.run import batches, cli, devices, files, missions, output, rundir
+from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
+from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
@@ -66,7 +68,7 @@ class Arguments:
     robots: tuple[str, ...] | None = None
     """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
     default."""
-    devices: int | None = None
+    devices: int | None = limited(None, at_least=1, at_most=MAX_DEVICES)
     """Number of accelerators, or of CPU threads, that share the missions. By default all
     accelerators, or one thread per core, at most 8."""
     cache: Path | None = cli.CACHE
@@ -90,6 +92,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
       policies: custom policies by name, to play in addition to `dqn.POLICIES`.
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    console = rich.console.Console()
     try:
         arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
@@ -101,44 +104,34 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
-    except ConfigError as error:
+        kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
+        with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
+            number, times = arguments.episodes * len(played), [time.perf_counter()]
+            player = missions.Player(scenario, compiler, number, workers)
+            player.wait()
+            times.append(time.perf_counter())
+            key = jax.random.key(arguments.seed)
+            found = player.play(key, models, played, arguments.episodes)
+            times.append(time.perf_counter())
+        block = summary.missions(scenario, found.metrics)
+        draw = functools.partial(
+            film.draw,
+            config,
+            found.recording.records,
+            found.recording.end,
+            models.fusion,
+            scenario.fields_of_view,
+        )
+        written = _write(arguments, trained, config, block, draw)
+    except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be used ({cli.reason(error)})")
-    kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
-    console = rich.console.Console()
-    key = jax.random.key(arguments.seed)
-    with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
-        begin, number = time.perf_counter(), arguments.episodes * len(played)
-        batch = batches.batch_of(config, number, workers)
-        runs_long = batches.runs_long(config, number)
-        player = missions.Player(scenario, compiler, batch, workers, runs_long)
-        player.wait()
-        compiled = time.perf_counter()
-        try:
-            found = player.play(key, models, played, arguments.episodes)
-        except StageError as error:
-            cli.fail(PROGRAM, str(error))
-        seconds = time.perf_counter() - compiled
-    block = summary.missions(scenario, found.metrics)
-    draw = functools.partial(
-        film.draw,
-        config,
-        found.recording.records,
-        found.recording.end,
-        models.fusion,
-        scenario.fields_of_view,
-    )
-    try:
-        written = _write(arguments, trained, config, block, draw)
-    except ConfigError as error:
-        cli.fail(PROGRAM, str(error))
-    except OSError as error:
-        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be written ({cli.reason(error)})")
-    rate = found.control_steps / seconds
     _print(console, block, arguments.episodes)
+    compilation, seconds = np.diff(times)
+    rate = found.control_steps / seconds
     say(
-        f"{number} missions in {seconds:.1f} s after {compiled - begin:.0f} s of compilation: "
+        f"{number} missions in {seconds:.1f} s after {compilation:.0f} s of compilation: "
         f"{rate:.0f} control steps/s, "
         f"{rate * CONTROL_PERIOD / TIMESTEP:.0f} physics steps/s"
     )
@@ -154,28 +147,26 @@ def _write(
     draw: Callable[[str], str],
 ) -> list[str]:
     """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
-    run, written, place = arguments.run, [], _place(config)
+    run, cases, written = arguments.run, summary.cases(missions), []
     if arguments.animate:
-        name = next(iter(summary.cases(missions)))
-        title = f"{name} policy, seed {arguments.seed}"
-        suffix = ""
-        if config != trained:
-            suffix = f"-{place}"
-            title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
-        film = run / f"mission-{name}-{arguments.seed}{suffix}.svg"
-        files.write(film, draw(title))
-        written.append(f"The first mission of {name} is in {film}.")
-    for case in summary.cases(missions).values():
+        name, elsewhere = next(iter(cases)), f"-{_place(config)}"
+        title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
+        if config == trained:
+            title, elsewhere = f"{name} policy, seed {arguments.seed}", ""
+        path = run / f"mission-{name}-{arguments.seed}{elsewhere}.svg"
+        files.write(path, draw(title))
+        written.append(f"The first mission of {name} is in {path}.")
+    for case in cases.values():
         case["seed"] = arguments.seed
-    path = run / EVALUATIONS / f"{place}-seed-{arguments.seed}-{arguments.episodes}-missions.json"
+    stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
     with files.locked(run, on_wait=say):
         # Another policy may have played in the same arenas before; by other code, it stands apart.
         others = summary.read_evaluations(run)
-        names = [path.stem, *(f"{path.stem}-{n + 2}" for n in range(len(others)))]
+        names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
         name = next(name for name in names if name not in others or _is_alike(others[name]))
-        path = path.with_name(f"{name}.json")
         blocks = {**(others[name]["mission"] if name in others else {}), **missions}
         found = _evaluation(config, compare.compared(blocks), rundir.origin())
+        path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
@@ -231,19 +222,16 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):
-        number = config.arena.num_pois
-        reason = (
-            f"must be {number}, as in training; only a run with dqn.task = team plays with other "
-            "numbers"
-        )
+        reason = f"must be {config.arena.num_pois}, as in training; only a run with "
+        reason += "dqn.task = team plays with other numbers"
         raise ConfigError("arena.num_pois", arena.num_pois, reason)
     robots, given = config.robots, arguments.robots
     if given is not None and sorted(given) != sorted(config.carried):
         # In one order, so that a team plays in the same arenas however it is named.
         robots = tuple(sorted(given, key=[*config.modalities, *given].index))
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
-    has_other = arena != config.arena
-    mdp = dataclasses.replace(config.mdp, partly_seen_starts=False) if has_other else config.mdp
+    is_partly_seen = config.mdp.partly_seen_starts and arena == config.arena
+    mdp = dataclasses.replace(config.mdp, partly_seen_starts=is_partly_seen)
     return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
 
 

@@ -2,16 +2,16 @@
 
 import contextlib
 import dataclasses
+import functools
 import itertools
 import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, cast
+from typing import Annotated, NoReturn, cast
 
 import jax
 import numpy as np
@@ -21,12 +21,11 @@ import rich.table
 from jaxsense import mission, summary
 from jaxsense.config import PRESETS, Config, ConfigError, PresetName
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.config.section import check_fields
-from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir, seeds
-from jaxsense.run.devices import Workers
-from jaxsense.run.interrupt import on_interrupt
+from jaxsense.config.section import check_fields, limited, require
+from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
+from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.output import say
+from jaxsense.run.output import on_interrupt, say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
@@ -58,7 +57,7 @@ class Arguments:
     """Seed of all randomness, from 0 to 2^32 - 1."""
     out: Path | None = None
     """Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`."""
-    num_seeds: int = 1
+    num_seeds: int = limited(1, at_least=1, at_most=10_000)
     """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
     which reports their means and 95 % confidence intervals."""
     file: Annotated[Path | None, Name("--config")] = None
@@ -72,7 +71,7 @@ class Arguments:
     """Print only errors, the path of the results and the next command."""
     tensorboard: bool = False
     """Also write event files for TensorBoard, to `tensorboard/` in the run."""
-    devices: int | None = None
+    devices: int | None = limited(None, at_least=1, at_most=MAX_DEVICES)
     """Number of accelerators, or of CPU threads, that share scenes and missions. By default all
     accelerators, or one thread per core, at most 8."""
     coordinator: str | None = None
@@ -89,6 +88,9 @@ class Arguments:
         if isinstance(self.file, str):
             raise ConfigError("config", self.file, "must be a path of printable characters")
         check_fields(self, bits=64)
+        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
+        is_in = self.seed + self.num_seeds <= 2**32
+        require(is_in, self, "num_seeds", "leads beyond seed 2^32 - 1")
         cli.require_directory("cache", self.cache)
 
     @property
@@ -111,38 +113,34 @@ def main(
     """
     monitor = Monitor(warn=_warn)
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
-    is_quiet, is_first = arguments.quiet, not arguments.process_index
-    if not is_first:
+    is_quiet = arguments.quiet
+    if is_helper := bool(arguments.process_index):
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     console = rich.console.Console(quiet=arguments.quiet)
-    waits = f"Waiting for the other processes at {arguments.coordinator}."
     try:
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
-            seeds.check(run)
-            devices.check(arguments.devices)
+            run.check_seeds()
             processes.join(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
-                begins=lambda: None if is_quiet else say(waits),
+                quiet=is_quiet,
             )
-            workers = devices.start(arguments.devices)
-            _train(monitor, arguments, run, workers, console, policies)
+            _train(arguments, run, monitor, console, policies)
         processes.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    except files.WriteError as error:
-        # Usually a full disk. Every file is written as a whole or not at all.
-        cli.fail(PROGRAM, f"cannot write {cli.reason(error)}; earlier checkpoints are intact")
     except OSError as error:
-        cli.fail(PROGRAM, f"{cli.reason(error)}; earlier checkpoints are intact")
-    if not is_first:
+        # Usually a full disk. Every file is written as a whole or not at all.
+        cannot = "cannot write " if isinstance(error, files.WriteError) else ""
+        cli.fail(PROGRAM, f"{cannot}{cli.reason(error)}; earlier checkpoints are intact")
+    if is_helper:
         return
     if not arguments.quiet:
         _print_summary(console, run)
-    first = next(path for path in seeds.paths(run).values() if (path / "report.html").exists())
     # A quiet run prints only these two lines.
+    first = next(path for path in run.seeds.values() if (path / "report.html").exists())
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
     trust = " --trust" if arguments.config.named_code else ""
     say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
@@ -153,18 +151,12 @@ def parse(
     change: Callable[[Config], Config] = lambda config: config,
     policies: OwnPolicies | None = None,
 ) -> Arguments:
-    """Reads the command line; ends the program with status 2 and one line if it is wrong.
+    """Reads the command line, or ends the program with status 2 and one line if it is wrong.
 
     Args:
       argv: the command line without the program.
       change: changes a preset before the other options do.
       policies: custom policies by name.
-
-    Returns:
-      The options.
-
-    Raises:
-      SystemExit: with status 2 if the command line is wrong, with status 0 after the help.
     """
     try:
         stored = _stored(argv, change)
@@ -178,16 +170,15 @@ def parse(
         mission.require_playable(arguments.config, policies)
         if arguments.tensorboard:
             terminal.require_tensorboard()
-        seeds.check_range(arguments.seed, arguments.num_seeds)
         if arguments.file is not None and arguments.preset != stored.preset:
             raise ConfigError("config", str(arguments.file), "has a preset; omit --preset")
         if arguments.resume is not None:
-            if arguments.out is not None or arguments.file is not None:
-                reason = "resumes in its own directory; omit --out and --config"
-                raise ConfigError("resume", str(arguments.resume), reason)
-            if arguments.settings != stored:
-                reason = "resumes with its own settings; omit others"
-                raise ConfigError("resume", str(arguments.resume), reason)
+            has_place = arguments.out is not None or arguments.file is not None
+            if has_place or arguments.settings != stored:
+                which = (
+                    "directory; omit --out and --config" if has_place else "settings; omit others"
+                )
+                raise ConfigError("resume", str(arguments.resume), f"resumes in its own {which}")
     except (ConfigError, OptionError) as error:
         cli.fail(PROGRAM, str(error))
     return arguments
@@ -207,70 +198,66 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     return Settings(preset, 0, change(PRESETS[preset]))
 
 
-def _open(arguments: Arguments) -> AbstractContextManager[RunDirectory]:
-    """The run directory: a new one, the one to resume, or that of a process that only helps."""
-    if arguments.process_index:
-        return _discarded(arguments.settings)
-    if arguments.resume is not None:
-        return RunDirectory.resume(arguments.resume, arguments.trust)
-    return RunDirectory.create(arguments.out, arguments.settings)
-
-
 @contextlib.contextmanager
-def _discarded(settings: Settings) -> Iterator[RunDirectory]:
-    """A run directory that is removed at the end."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        RunDirectory.create(Path(folder) / "run", settings) as run,
-    ):
-        yield run
+def _open(arguments: Arguments) -> Iterator[RunDirectory]:
+    """The run directory: a new one, the one to resume, or that of a process that only helps."""
+    with contextlib.ExitStack() as stack:
+        if arguments.process_index:  # nobody reads its files
+            path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+            opened = RunDirectory.create(path, arguments.settings)
+        elif arguments.resume is not None:
+            opened = RunDirectory.resume(arguments.resume, arguments.trust)
+        else:
+            opened = RunDirectory.create(arguments.out, arguments.settings)
+        yield stack.enter_context(opened)
 
 
 def _train(
-    monitor: Monitor,
     arguments: Arguments,
     run: RunDirectory,
-    workers: Workers,
+    monitor: Monitor,
     console: rich.console.Console,
     policies: OwnPolicies | None,
 ) -> None:
-    """Trains all seeds with the same programs, and writes their results."""
-    settings, failed = run.settings, dict[int, str]()
-    kept = cli.keep_programs(PROGRAM, arguments.cache, settings.config, has_own_code=bool(policies))
+    """Trains the seeds that are left with the same programs, and sums all up."""
+    config, failed = run.settings.config, dict[int, str]()
+    workers = devices.start(arguments.devices)
+    kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
+    is_left = np.array([not (path / "summary.json").exists() for path in run.seeds.values()])
+    left = [*itertools.compress(run.seeds.items(), processes.of_first_process(is_left))]
 
     def stop() -> None:
         monitor.stop()
         if not arguments.quiet:
             say("Saving and stopping. Press Ctrl-C again to quit immediately.")
 
-    paths = seeds.paths(run).items()
-    is_left = np.array([not (path / "summary.json").exists() for _, path in paths])
-    left = list(itertools.compress(paths, processes.of_first_process(is_left)))
+    compiled = pipeline.compiled(config, monitor, workers, kept, len(left), policies)
     try:
-        with (
-            on_interrupt(stop),
-            pipeline.compiled(
-                settings.config, monitor, workers, kept, len(left), policies
-            ) as programs,
-        ):
+        with on_interrupt(stop), compiled as programs:
             for seed, path in left:
-                with seeds.open_run(run, seed, path) as of_seed:
-                    failed |= _train_one(arguments, of_seed, programs, monitor, console)
+                with run.of_seed(seed, path) as of_seed:
+                    if reason := _train_one(arguments, of_seed, programs, monitor, console):
+                        failed[seed] = reason
                 monitor.stopwatch.restart()
     except Stopped:
-        if jax.process_index() == 0:
-            again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
-            again += " --trust" if settings.config.named_code else ""
-            again += " with the same processes" if jax.process_count() > 1 else ""
-            output.complain(f"Stopped; all training so far is saved. To resume: {again}")
-        # Other processes may be blocked in a collective; wait only briefly.
-        processes.leave(processes.LEAVE_TIMEOUT)
-        sys.exit(output.INTERRUPTED)
-    if len(failed) == settings.num_seeds:
+        _end_stopped(run)
+    if len(failed) == run.settings.num_seeds:
         sys.exit(2)
     # Another process has none of the seeds that were finished before.
-    if settings.num_seeds > 1 and jax.process_index() == 0:
+    if run.settings.num_seeds > 1 and jax.process_index() == 0:
         _summarise_seeds(run, failed)
+
+
+def _end_stopped(run: RunDirectory) -> NoReturn:
+    """Says how to go on with a run, and ends the process."""
+    if jax.process_index() == 0:
+        again = f"{command(PROGRAM)} --resume {shlex.quote(str(run.path))}"
+        again += " --trust" if run.settings.config.named_code else ""
+        again += " with the same processes" if jax.process_count() > 1 else ""
+        output.complain(f"Stopped; all training so far is saved. To resume: {again}")
+    # Other processes may be blocked in a collective; wait only briefly.
+    processes.leave(processes.LEAVE_TIMEOUT)
+    sys.exit(output.INTERRUPTED)
 
 
 def _train_one(
@@ -279,48 +266,44 @@ def _train_one(
     programs: Programs,
     monitor: Monitor,
     console: rich.console.Console,
-) -> dict[int, str]:
+) -> str | None:
     """Trains one seed and writes its run; returns why it failed, if it did."""
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(terminal.tensorboard(run.path / "tensorboard"))
     if several := compare.several_origins(run.made("mission")):
         _warn(f"{run.path}: {several}")
-    config, checkpoints = run.settings.config, run.checkpoints
-    key = jax.random.key(run.settings.seed)
-    # In one thread of its own, because matplotlib does not work in several at once.
-    with (
-        Display(console, records, quiet=arguments.quiet) as display,
-        ThreadPoolExecutor(1, "draw") as artist,
-    ):
+    with Display(console, records, quiet=arguments.quiet) as display:
         monitor.begin(display.show)
         try:
-            learned = pipeline.learn(key, config, programs, monitor, checkpoints)
-            drawn = [artist.submit(lambda: _drawing().of_training(config, learned))]
-            played = pipeline.play(key, config, programs, learned, checkpoints)
+            results, pictures = _results(run, programs, monitor)
         except StageError as error:
             _warn(f"{error}; earlier checkpoints are in {run.path}")
-            return {run.settings.seed: str(error)}
-        drawn.append(artist.submit(lambda: _drawing().of_missions(config, learned, played)))
-        pictures = drawn[0].result() | drawn[1].result()
+            return str(error)
         monitor.check_stop()
         header = _header(run, run.sign("mission"))
-        found: summary.Summary = {
-            **header,
-            "timing": monitor.stopwatch.timing(),
-            **learned.results,
-            "mission": played.missions,
-        }
-        _drawing().write(run.path, config, pictures, found)
-        monitor.check_stop()
-        # Last, for it marks the run as finished.
-        rundir.write_json(run.path / "summary.json", found)
-    return {}
+        _write(run, {**header, "timing": monitor.stopwatch.timing(), **results}, pictures)
+    return None
+
+
+def _results(
+    run: RunDirectory, programs: Programs, monitor: Monitor
+) -> tuple[summary.Results, dict[str, bytes | str]]:
+    """Trains one seed and plays its missions; draws both meanwhile."""
+    key, config = jax.random.key(run.settings.seed), run.settings.config
+    # In one thread of its own, because matplotlib does not work in several at once.
+    with ThreadPoolExecutor(1, "draw") as artist:
+        learned = pipeline.learn(key, config, programs, monitor, run.checkpoints)
+        of_training = artist.submit(lambda: _drawing().of_training(config, learned))
+        played = pipeline.play(key, config, programs, learned, run.checkpoints)
+        of_missions = artist.submit(lambda: _drawing().of_missions(config, learned, played))
+        pictures = of_training.result() | of_missions.result()
+    return {**learned.results, "mission": played.missions}, pictures
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
-    paths = [path for seed, path in seeds.paths(run).items() if seed not in failed]
+    paths = [path for seed, path in run.seeds.items() if seed not in failed]
     timing, of_each, means = compare.of_seeds([summary.read(path) for path in paths])
     made = [(path.name, each) for path in paths for each in read_made(path)]
     seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
@@ -328,9 +311,13 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     found: summary.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
-    curves = seeds.rewards(paths, run.settings.config, _warn)
-    config = run.settings.config
-    _drawing().write(run.path, config, _drawing().of_seeds(curves, means), found)
+    curves = rundir.rewards(paths, run.settings.config, _warn)
+    _write(run, found, _drawing().of_seeds(curves, means))
+
+
+def _write(run: RunDirectory, found: summary.Summary, pictures: dict[str, bytes | str]) -> None:
+    """Writes pictures, page and summary; the last one marks the run as finished."""
+    _drawing().write(run.path, run.settings.config, pictures, found)
     rundir.write_json(run.path / "summary.json", found)
 
 
@@ -341,9 +328,7 @@ def _drawing() -> ModuleType:
     return drawing
 
 
-def _warn(text: str) -> None:
-    """Prints a warning."""
-    cli.warn(PROGRAM, text)
+_warn = functools.partial(cli.warn, PROGRAM)
 
 
 def _header(run: RunDirectory, made: list[Made]) -> Header:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief, pytree
 from jaxsense.mission.state import DRIVING, ENDED, FACING, Record
-from jaxsense.run.films import Recording
+from jaxsense.run.missions import Recording
 
 CONFIG = PRESETS["smoke"]
 CLASS_BELIEFS = Belief(

@@ -154,8 +154,8 @@ MEASURED = {
 class Player:
     """Plays a mission that was never played, in place of `missions.Player`."""
 
-    def __init__(self, scenario, compiler, batch):
-        assert batch == 1
+    def __init__(self, scenario, compiler, total):
+        assert total == 1
 
     def play(self, key, models, played, episodes):
         (name,) = played

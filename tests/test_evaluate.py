@@ -24,7 +24,7 @@ from smoke import MISSION_KEYS, error_line
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
 from jaxsense.config import CONTROL_PERIOD, PRESETS, ConfigError
-from jaxsense.run import batches, cli, devices, files, missions, rundir
+from jaxsense.run import cli, devices, files, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.rundir import RunDirectory
@@ -71,6 +71,13 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
     assert "PoIs wrong" in "".join(plot.getroot().itertext())
 
 
+@pytest.fixture
+def copy(evaluated, tmp_path):
+    """A copy of the evaluated run, to be changed."""
+    shutil.copytree(evaluated[0], tmp_path / "run")
+    return tmp_path / "run"
+
+
 def write(arguments, missions):
     config, models = jaxsense.load(arguments.run)
     played = recording()
@@ -80,49 +87,53 @@ def write(arguments, missions):
     return evaluate._write(arguments, config, config, missions, draw)
 
 
-def test_policies_that_play_in_the_same_arenas_share_a_file(evaluated, tmp_path):
-    path = tmp_path / "run"
-    shutil.copytree(evaluated[0], path)
-    blocks = read(path)["mission"]
-    one = {name: blocks[name] for name in ("nearest", "bytes_per_detection")}
+def only(blocks, *names):
+    """Some cases, as another evaluation has played them."""
+    return {name: blocks[name] for name in (*names, "bytes_per_detection")}
+
+
+def test_policies_that_play_in_the_same_arenas_share_a_file(copy):
+    blocks = read(copy)["mission"]
+    one = only(blocks, "nearest")
     one["nearest"]["time_s"] = 99.0
-    write(evaluate.Arguments(path, episodes=1), one)
-    assert read(path)["mission"]["nearest"]["time_s"] == 99.0
-    assert set(read(path)["mission"]) == set(blocks)
-    # Of another seed, nothing is compared with them.
-    write(evaluate.Arguments(path, episodes=1, seed=3), one)
-    of_seed = read(path, NAME.replace("seed-0", "seed-3"))["mission"]
-    assert set(of_seed) == {"nearest", "bytes_per_detection"}
-    assert of_seed["nearest"]["seed"] == 3
-    page = (path / "report.html").read_text(encoding="utf-8")
+    write(evaluate.Arguments(copy, episodes=1), one)
+    assert read(copy)["mission"]["nearest"]["time_s"] == 99.0
+    assert set(read(copy)["mission"]) == set(blocks)
+    # Of another seed, nothing is compared with them; robots that are alone are not drawn.
+    alone = {"camera_alone": blocks["nearest"], **one}
+    del alone["nearest"]
+    write(evaluate.Arguments(copy, episodes=1, seed=3), alone)
+    of_seed = NAME.replace("seed-0", "seed-3")
+    found = read(copy, of_seed)["mission"]
+    assert set(found) == set(alone)
+    assert found["camera_alone"]["seed"] == 3
+    assert not (copy / "evaluations" / of_seed).with_suffix(".svg").exists()
+    page = (copy / "report.html").read_text(encoding="utf-8")
     assert page.count("Evaluation: 3 PoIs in 3 m") == 2
+    assert "camera_alone" in page
 
 
 @pytest.mark.parametrize("other", ["code", "JAX", "unknown"])
-def test_evaluations_by_others_stand_apart(evaluated, tmp_path, other):
-    path = tmp_path / "run"
-    shutil.copytree(evaluated[0], path)
-    before, origin = read(path), rundir.origin()
-    made = {
+def test_evaluations_by_others_stand_apart(copy, other):
+    before, origin = read(copy), rundir.origin()
+    before["origin"] = {
         "code": {**origin, "source": "other"},
         "JAX": {**origin, "versions": {**origin["versions"], "jax": "0.0.1"}},
         "unknown": None,
     }[other]
-    before = {**before, "origin": made} if made else {**before}
-    if made is None:
+    if other == "unknown":
         del before["origin"]
-    file = path / "evaluations" / f"{NAME}.json"
+    file = copy / "evaluations" / f"{NAME}.json"
     file.write_text(json.dumps(before))
-    one = {name: before["mission"][name] for name in ("nearest", "bytes_per_detection")}
     for _ in range(2):  # the second time, among those that this code has made
-        write(evaluate.Arguments(path, episodes=1), one)
+        write(evaluate.Arguments(copy, episodes=1), only(before["mission"], "nearest"))
     assert json.loads(file.read_text()) == before
-    apart = read(path, f"{NAME}-2")
+    apart = read(copy, f"{NAME}-2")
     assert set(apart["mission"]) == {"nearest", "bytes_per_detection"}
     assert apart["origin"] == origin
-    assert len([*(path / "evaluations").glob("*.json")]) == 2
+    assert len([*(copy / "evaluations").glob("*.json")]) == 2
     titles = re.findall(
-        "<h3>Evaluation: (.*)</h3>", (path / "report.html").read_text(encoding="utf-8")
+        "<h3>Evaluation: (.*)</h3>", (copy / "report.html").read_text(encoding="utf-8")
     )
     words = {"code": "source other", "JAX": "jax 0.0.1", "unknown": "source unknown"}[other]
     ours, theirs = sorted(titles, key=len)
@@ -131,60 +142,43 @@ def test_evaluations_by_others_stand_apart(evaluated, tmp_path, other):
     assert f"; {words}" in theirs
 
 
-def test_a_plot_of_teams_compares_figures_of_one_origin(evaluated, tmp_path, monkeypatch):
-    path, drawn = tmp_path / "run", []
-    shutil.copytree(evaluated[0], path)
+def test_a_plot_of_teams_compares_figures_of_one_origin(copy, monkeypatch):
+    drawn = []
     monkeypatch.setattr(evaluate.result_plots, "places", drawn.append)
     monkeypatch.setattr(evaluate.drawing, "svg", lambda plot: b"")
-    here = read(path)
+    here = read(copy)
     own = {"origin": here["origin"], "other": {**here["origin"], "commit": "other"}}
     for pois, origin in ((4, own["origin"]), (5, own["other"])):
         place = {**here, "num_pois": pois, "origin": origin}
-        (path / "evaluations" / f"{pois}.json").write_text(json.dumps(place))
-    evaluate._report(path, jaxsense.load(path)[0])
+        (copy / "evaluations" / f"{pois}.json").write_text(json.dumps(place))
+    evaluate._report(copy, jaxsense.load(copy)[0])
     assert sorted(place["num_pois"] for place in drawn[0]) == [3, 3, 4]
 
 
-def test_an_evaluation_of_robots_that_are_alone_has_no_plot_of_policies(evaluated, tmp_path):
-    path = tmp_path / "run"
-    shutil.copytree(evaluated[0], path)
-    blocks = read(path)["mission"]
-    alone = {"camera_alone": blocks["nearest"]}
-    alone["bytes_per_detection"] = blocks["bytes_per_detection"]
-    write(evaluate.Arguments(path, episodes=1, seed=3), alone)
-    of_seed = NAME.replace("seed-0", "seed-3")
-    assert set(read(path, of_seed)["mission"]) == set(alone)
-    assert not (path / "evaluations" / of_seed).with_suffix(".svg").exists()
-    assert "camera_alone" in (path / "report.html").read_text(encoding="utf-8")
-
-
-def test_an_evaluation_waits_for_another_one_that_writes_and_says_so(evaluated, tmp_path, capsys):
-    path = tmp_path / "run"
-    shutil.copytree(evaluated[0], path)
-    blocks, said = read(path)["mission"], ""
-    one = {name: blocks[name] for name in ("latent", "bytes_per_detection")}
+def test_an_evaluation_waits_for_another_one_that_writes_and_says_so(copy, capsys):
+    blocks, said = read(copy)["mission"], ""
     with ThreadPoolExecutor(1) as executor:
-        with files.locked(path):
-            writing = executor.submit(write, evaluate.Arguments(path, episodes=1), one)
+        with files.locked(copy):
+            writing = executor.submit(
+                write, evaluate.Arguments(copy, episodes=1), only(blocks, "latent")
+            )
             while not said:
                 assert not wait((writing,), timeout=0.1).done
                 said = capsys.readouterr().out
             blocks["naive"]["time_s"] = 77.0
-            changed = {**read(path), "mission": blocks}
-            (path / "evaluations" / f"{NAME}.json").write_text(json.dumps(changed))
+            changed = {**read(copy), "mission": blocks}
+            (copy / "evaluations" / f"{NAME}.json").write_text(json.dumps(changed))
         writing.result()
-    assert said == f"Waiting for another process to finish writing to {path}.\n"
-    assert read(path)["mission"]["naive"]["time_s"] == 77.0
+    assert said == f"Waiting for another process to finish writing to {copy}.\n"
+    assert read(copy)["mission"]["naive"]["time_s"] == 77.0
 
 
 def test_paths_are_printed_as_they_are(evaluated, tmp_path, capsys):
     path = tmp_path / f"a[b]{'c' * 90}"
     shutil.copytree(evaluated[0], path)
     blocks = read(path)["mission"]
-    for line in write(evaluate.Arguments(path, episodes=1, animate=True), blocks):
-        evaluate.say(line)
-    film, metrics = capsys.readouterr().out.splitlines()
-    assert film == f"The first mission of latent is in {path}/mission-latent-0.svg."
+    first, metrics = write(evaluate.Arguments(path, episodes=1, animate=True), blocks)
+    assert first == f"The first mission of latent is in {path}/mission-latent-0.svg."
     assert f" {path}/evaluations/{NAME}.json, and with all others in {path}/report.html." in metrics
     evaluate._print(
         rich.console.Console(width=80, force_terminal=True, color_system=None), blocks, 1
@@ -203,7 +197,7 @@ def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
 import os, sys
 from jaxsense import train
 from jaxsense.run import output
-train._train = lambda monitor, arguments, run, *more: (run.path / "summary.json").write_text(
+train._train = lambda arguments, run, *more: (run.path / "summary.json").write_text(
     open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
 resume = lambda: train.main(["--resume", sys.argv[2]])
 output.run(resume)
@@ -221,29 +215,21 @@ output.run(resume)
 
 
 def test_evaluate_prints_the_comparison(evaluated):
-    _, _, printed = evaluated
-    for words in (
-        "latent",
-        "naive",
-        "random",
-        "right",
-        "against",
-        "control steps/s",
-        "12 missions",  # one of each policy
-    ):
-        assert words in printed
+    # One mission of each policy.
+    for words in ("latent", "naive", "random", "against", "control steps/s", "12 missions"):
+        assert words in evaluated[2]
 
 
 def test_missions_elsewhere_have_the_settings_that_are_asked_for():
-    config, path = PRESETS["smoke"], Path("run")
+    config, anything = PRESETS["smoke"], lambda n: True
 
-    def any_number(num_pois: int) -> bool:
-        return True
+    def elsewhere(config, *arena, robots=None, plays=anything, **sizes):
+        arena = evaluate.ArenaArguments(*arena, **sizes)
+        return evaluate._elsewhere(
+            evaluate.Arguments(Path("run"), arena=arena, robots=robots), config, plays
+        )
 
-    arguments = evaluate.Arguments(
-        path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "camera", "lidar")
-    )
-    there = evaluate._elsewhere(arguments, config, any_number)
+    there = elsewhere(config, side=4.0, robots=("camera", "camera", "lidar"))
     assert (there.arena.side, there.arena.num_pois) == (4.0, 3)
     assert there.carried == ("camera", "camera", "lidar")
     assert evaluate._place(there) == "3-points-4-m-2-camera-1-lidar"
@@ -251,15 +237,9 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     crowd = dataclasses.replace(there, robots=("camera", "lidar") * 32)
     assert evaluate._place(crowd) == "3-points-4-m-32-camera-32-lidar"
     # However it is named, a team plays in the same arenas.
-    mixed = evaluate.Arguments(
-        path, arena=evaluate.ArenaArguments(side=4.0), robots=("camera", "lidar", "camera")
-    )
-    assert evaluate._elsewhere(mixed, config, any_number) == there
+    assert elsewhere(config, side=4.0, robots=("camera", "lidar", "camera")) == there
     # What is asked for is no other place if the run has it already.
-    same = evaluate.Arguments(
-        path, arena=evaluate.ArenaArguments(3, 3.0), robots=("lidar", "camera")
-    )
-    assert evaluate._elsewhere(same, config, any_number) == config
+    assert elsewhere(config, 3, 3.0, robots=("lidar", "camera")) == config
     # A policy for any number of points has no limit to the looks of a start.
     team = PRESETS["team"]
     partly = dataclasses.replace(
@@ -268,14 +248,9 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         team=dataclasses.replace(team.team, num_pois=(3, 8)),
         evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
     )
-    there = evaluate._elsewhere(
-        evaluate.Arguments(path, arena=evaluate.ArenaArguments(30, 8.0)), partly, any_number
-    )
-    assert there.arena.num_pois == 30
+    assert elsewhere(partly, 30, 8.0).arena.num_pois == 30
     with pytest.raises(ConfigError, match=r"arena\.num_pois = 4: must be 3, as in training"):
-        evaluate._elsewhere(
-            evaluate.Arguments(path, arena=evaluate.ArenaArguments(4)), config, lambda n: n == 3
-        )
+        elsewhere(config, 4, plays=lambda n: n == 3)
 
 
 @pytest.mark.slow  # compiles missions of three robots
@@ -322,8 +297,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
         devices.start(None),
     )
     with Compiler(Monitor(), kept) as compiler:
-        scenario, batch = mission.make_mission(config), batches.batch_of(config, 11, workers)
-        player = missions.Player(scenario, compiler, batch, workers)
+        player = missions.Player(mission.make_mission(config), compiler, 11, workers)
         played = player.play(jax.random.key(0), models, {"latent": case}, 1)
     found, recording = played.metrics["latent"], played.recording
     np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))

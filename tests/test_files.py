@@ -4,7 +4,6 @@ import errno
 import os
 import queue
 import stat
-import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -24,14 +23,21 @@ TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))
 
 
-def test_a_file_is_replaced_as_a_whole_and_made_durable(tmp_path, monkeypatch):
-    path, synced = tmp_path / "file", []
-    sync = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda n: (synced.append(os.fstat(n).st_mode), sync(n)))
+@pytest.fixture
+def synced(monkeypatch):
+    """Whether each thing that reaches the disk is a directory, in order."""
+    found, sync = [], os.fsync
+    is_directory = lambda n: stat.S_ISDIR(os.fstat(n).st_mode)  # noqa: E731
+    monkeypatch.setattr(os, "fsync", lambda n: (found.append(is_directory(n)), sync(n)))
+    return found
+
+
+def test_a_file_is_replaced_as_a_whole_and_made_durable(tmp_path, synced):
+    path = tmp_path / "file"
     files.write(path, "first")
     files.write(path, b"second")
     assert path.read_bytes() == b"second"
-    assert [stat.S_ISDIR(mode) for mode in synced] == [False, True] * 2
+    assert synced == [False, True] * 2
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -70,6 +76,48 @@ def test_many_writers_of_one_file_never_mix(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_new_file_has_its_name_once_it_is_whole_and_takes_that_of_no_other(
+    tmp_path, monkeypatch, has_links, synced
+):
+    def without_links(*_):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", without_links)
+    path, other = tmp_path / "file", tmp_path / "other"
+    with files.new(path) as file:
+        file.write(b"new")
+        assert not path.exists()
+        (partial,) = tmp_path.iterdir()
+        assert files.is_unfinished(partial, "file")
+    assert path.read_bytes() == b"new"
+    assert synced == [False, True]
+    with pytest.raises(FileExistsError), files.new(path):
+        pass
+    with pytest.raises(ZeroDivisionError), files.new(other):
+        1 / 0  # noqa: B018
+    with pytest.raises(FileExistsError), files.new(other) as file:
+        other.write_text("of another process", encoding="utf-8")
+    assert other.read_text(encoding="utf-8") == "of another process"
+    assert sorted(tmp_path.iterdir()) == [path, other]
+
+
+def test_only_what_a_write_has_left_is_removed(tmp_path):
+    left = ".summary.json.0123456789abcdef.unfinished"
+    kept = [".thesis.unfinished", "a.0123456789abcdef.unfinished", ".a.0123.unfinished"]
+    (tmp_path / "seed-1").mkdir()
+    kept.append(f"seed-1/{left}")  # of a process that may be writing it
+    for name in (left, *kept):
+        (tmp_path / name).write_text("precious")
+    folder = tmp_path / ".b.0123456789abcdef.unfinished"
+    folder.mkdir()
+    files.remove_unfinished(tmp_path)
+    assert not (tmp_path / left).exists()
+    assert folder.exists()
+    assert all((tmp_path / name).exists() for name in kept)
+
+
 def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "_WAIT_BEFORE_NOTICE", 0.1)
     order, said = [], queue.Queue()
@@ -91,43 +139,20 @@ def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
     assert said.empty()
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
 @pytest.mark.skipif(sys.platform == "win32", reason="has no flock")
-def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
     import fcntl
 
     def flock(descriptor, operation):
-        raise OSError(number, os.strerror(number))
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(fcntl, "flock", flock)
-    with pytest.raises(OSError, match=os.strerror(number)), files.locked(tmp_path):
-        pass
     settings = Settings("smoke", 0, PRESETS["smoke"])
     with (
-        pytest.raises(ConfigError, match=r"out = '.*run': cannot be written \(.+\)"),
+        pytest.raises(ConfigError, match=r"out = '.*run': cannot be written \(No locks"),
         RunDirectory.create(tmp_path / "run", settings),
     ):
         pass
-
-
-@pytest.mark.slow
-def test_a_system_without_fcntl_can_lock():
-    program = """
-import sys, tempfile
-from pathlib import Path
-sys.modules["fcntl"] = None
-import jaxsense.train, jaxsense.evaluate
-from jaxsense.run import files
-with tempfile.TemporaryDirectory() as folder, files.locked(Path(folder)):
-    try:
-        with files.locked(Path(folder)):
-            print("twice")
-    except BlockingIOError:
-        print("once")
-"""
-    command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout) == (0, "once\n"), ended.stderr
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
@@ -176,142 +201,6 @@ def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage):
     assert len(said) == 1
 
 
-def test_a_missing_checkpoint_is_noticed(tmp_path):
-    said = []
-    checkpoints = Checkpoints(tmp_path, said.append)
-    checkpoints.save("tree", TREE)
-    (tmp_path / "tree.msgpack").unlink()
-    with pytest.raises(ConfigError, match="is missing"):
-        Checkpoints(tmp_path).load("tree", SHAPES)
-    assert checkpoints.load_or_forget("tree", SHAPES) is None
-    assert "tree.msgpack': is missing" in said[0]
-
-
-def test_a_process_that_is_killed_after_its_first_checkpoint_has_lost_no_list(
-    tmp_path, monkeypatch
-):
-    write = files.write_digested
-
-    def killed(path, content):
-        write(path, content)
-        if path.name == "tree.msgpack":
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(files, "write_digested", killed)
-    with pytest.raises(KeyboardInterrupt):
-        Checkpoints(tmp_path).save("tree", TREE)
-    monkeypatch.undo()
-    checkpoints = Checkpoints(tmp_path, pytest.fail)
-    checkpoints.check()
-    assert checkpoints.load("tree", SHAPES) is not None
-
-
-@pytest.mark.parametrize(
-    ("damage", "expected"),
-    [
-        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "saved.msgpack': is damaged"),
-        (lambda file: file.write_bytes(b"x" + file.read_bytes()), "saved.msgpack': is damaged"),
-        (lambda file: file.unlink(), "saved.msgpack': is missing"),
-    ],
-)
-def test_a_list_of_checkpoints_that_is_damaged_is_noticed_and_made_anew(tmp_path, damage, expected):
-    said = []
-    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
-    checkpoints.check()  # nothing was saved, and nothing is missing
-    checkpoints.save("tree", TREE)
-    checkpoints.save("unfinished/jmvae", TREE)
-    checkpoints.check()
-    assert not said
-    damage(tmp_path / "checkpoints" / "saved.msgpack")
-    checkpoints.check()
-    (line,) = said
-    assert expected in line
-    assert line.endswith("; resuming from all checkpoints found")
-    checkpoints.check()
-    for name in ("tree", "unfinished/jmvae"):
-        assert checkpoints.load_or_forget(name, SHAPES) is not None
-    checkpoints.save("other", TREE)
-    (tmp_path / "checkpoints" / "other.msgpack").unlink()
-    assert len(said) == 1
-    checkpoints.check()
-    assert "other.msgpack': is missing; retraining it" in said[1]
-    checkpoints.check()
-    assert checkpoints.load_or_forget("other", SHAPES) is None
-    assert len(said) == 2
-
-
-def test_all_that_is_damaged_is_named_once(tmp_path):
-    said = []
-    checkpoints = Checkpoints(tmp_path / "checkpoints", said.append)
-    checkpoints.check(is_begun=False)
-    assert not said
-    checkpoints.check(is_begun=True)
-    assert "checkpoints': is missing; retraining everything" in said.pop()
-    for name in ("jmvae", "class_beliefs", "detectors", "mdp"):
-        checkpoints.save(name, TREE)
-    file = tmp_path / "checkpoints" / "class_beliefs.msgpack"
-    file.write_bytes(file.read_bytes()[:-1])
-    for name in ("jmvae", "mdp"):
-        (tmp_path / "checkpoints" / f"{name}.msgpack").unlink()
-    (tmp_path / "checkpoints" / "jmvae.msgpack").mkdir()  # cannot be read
-    checkpoints.check()
-    for name in ("class_beliefs", "jmvae", "mdp") * 2:
-        assert checkpoints.load_or_forget(name, SHAPES) is None
-    assert "mdp.msgpack': is missing" in said[0]
-    assert "class_beliefs.msgpack': is damaged" in said[1]
-    assert "jmvae.msgpack': cannot be read (Is a directory)" in said[2]
-    assert checkpoints.load_or_forget("detectors", SHAPES) is not None
-    checkpoints.check()
-    assert len(said) == 3
-
-
-def test_only_what_a_write_has_left_is_removed(tmp_path):
-    kept = [".thesis.unfinished", "a.0123456789abcdef.unfinished", ".a.0123.unfinished"]
-    for name in kept:
-        (tmp_path / name).write_text("precious")
-    folder = tmp_path / ".b.0123456789abcdef.unfinished"
-    folder.mkdir()
-    left = tmp_path / ".summary.json.0123456789abcdef.unfinished"
-    left.write_text("{")
-    (tmp_path / "seed-1").mkdir()
-    others = tmp_path / "seed-1" / left.name  # of a process that may be writing it
-    others.write_text("{")
-    files.remove_unfinished(tmp_path)
-    assert not left.exists()
-    assert others.exists()
-    assert folder.exists()
-    assert all((tmp_path / name).exists() for name in kept)
-
-
-@pytest.mark.parametrize("has_links", [True, False])
-def test_a_new_file_has_its_name_once_it_is_whole_and_takes_that_of_no_other(
-    tmp_path, monkeypatch, has_links
-):
-    def without_links(*_):
-        raise OSError(errno.EPERM, "Operation not permitted")
-
-    if not has_links:
-        monkeypatch.setattr(os, "link", without_links)
-    path, synced, sync = tmp_path / "file", [], os.fsync
-    monkeypatch.setattr(os, "fsync", lambda n: (synced.append(os.fstat(n).st_mode), sync(n)))
-    with files.new(path) as file:
-        file.write(b"new")
-        assert not path.exists()
-        (partial,) = tmp_path.iterdir()
-        assert files.is_unfinished(partial, "file")
-    assert path.read_bytes() == b"new"
-    assert [stat.S_ISDIR(mode) for mode in synced] == [False, True]
-    with pytest.raises(FileExistsError), files.new(path):
-        pass
-    other = tmp_path / "other"
-    with pytest.raises(ZeroDivisionError), files.new(other):
-        1 / 0  # noqa: B018
-    with pytest.raises(FileExistsError), files.new(other) as file:
-        other.write_text("of another process", encoding="utf-8")
-    assert other.read_text(encoding="utf-8") == "of another process"
-    assert sorted(tmp_path.iterdir()) == [path, other]
-
-
 @pytest.mark.parametrize(
     ("shapes", "expected"),
     [
@@ -339,28 +228,12 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     np.testing.assert_array_equal(found[0].params["w"], [1, 1])
     np.testing.assert_array_equal(curves["loss"], [1.5, np.nan])
     assert curves["none"] == []
+    theirs = tmp_path / "unfinished" / "theirs.msgpack"
+    theirs.write_text("precious")
+    checkpoints.forget_unfinished(["jmvae"])
+    assert [*(tmp_path / "unfinished").iterdir()] == [theirs]
+    theirs.unlink()
     checkpoints.forget_unfinished(["jmvae"])
     assert not (tmp_path / "unfinished").exists()
     assert checkpoints.load_unfinished("jmvae", state, 3) is None
     assert checkpoints.load("tree", SHAPES) is not None
-    checkpoints.check()  # nothing is missing
-
-
-def test_files_of_others_beside_checkpoints_stay(tmp_path):
-    theirs, said = tmp_path / "checkpoints", []
-    precious = [theirs / name for name in ("a.msgpack", "unfinished/b.msgpack", "c/d.msgpack")]
-    for path in precious:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text("precious", encoding="utf-8")
-    checkpoints = Checkpoints(theirs, said.append)
-    checkpoints.save_unfinished("jmvae", Unfinished(1, TREE, {}))
-    (theirs / "saved.msgpack").unlink()
-    for _ in range(2):
-        checkpoints.check()
-    assert [line.partition("saved.msgpack")[2] for line in said] == [
-        "': is missing; resuming from all checkpoints found"
-    ]
-    assert checkpoints.load_unfinished("jmvae", TREE, 3) is not None
-    checkpoints.forget_unfinished(["jmvae"])
-    assert checkpoints.load_unfinished("jmvae", TREE, 3) is None
-    assert all(path.read_text(encoding="utf-8") == "precious" for path in precious)

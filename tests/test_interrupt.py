@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from jaxsense.run import interrupt
-from jaxsense.run.interrupt import on_interrupt
+from jaxsense.run import output
+from jaxsense.run.output import on_interrupt
 
 # The module alone: the package would be imported for seconds.
 PROGRAM = """
@@ -23,11 +23,12 @@ with on_interrupt(lambda: print("stopping", flush=True)):
 """
 
 
-@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("first", "second"), [(signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)]
+)
 def test_the_first_signal_stops_in_order_and_the_second_one_at_once(first, second):
     signals = str(int(first)), str(int(second))
-    command = [sys.executable, "-c", PROGRAM, interrupt.__file__, *signals]
+    command = [sys.executable, "-c", PROGRAM, output.__file__, *signals]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 128 + second
     assert ended.stdout == "stopping\nstill here\n"

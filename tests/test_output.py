@@ -47,13 +47,7 @@ def broken():
 @pytest.mark.parametrize("output", OUTPUTS)
 @pytest.mark.parametrize(
     "argv",
-    [
-        ["--version"],
-        ["--help"],
-        pytest.param(["tasks"], marks=pytest.mark.slow),  # each imports JAX
-        pytest.param(["train", "--help-all"], marks=pytest.mark.slow),
-        pytest.param(["export", "--help"], marks=pytest.mark.slow),
-    ],
+    [["--help"], pytest.param(["train", "--help-all"], marks=pytest.mark.slow)],  # imports JAX
     ids=" ".join,
 )
 def test_a_result_that_cannot_be_printed_is_told_in_one_line(argv, output):
@@ -93,9 +87,8 @@ def test_a_command_ends_with_its_own_status(code, expected, output):
 
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_python_has_nothing_to_add_at_its_end(output):
-    code = "from jaxsense.run import output; output.run(lambda: print('x' * 100_000))"
-    status, told = call(["-c", code.replace("print", "output.say")], output)
-    assert (status, told) == (0, "")
+    code = "from jaxsense.run import output; output.run(lambda: output.say('x' * 100_000))"
+    assert call(["-c", code], output) == (0, "")
 
 
 def test_errors_go_nowhere_if_standard_error_is_closed():

@@ -3,12 +3,13 @@
 import errno
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import pytest
@@ -27,25 +28,39 @@ def test_a_json_file_is_text_for_people(tmp_path):
     assert text == '{\n  "a": {\n    "b": 1.5\n  },\n  "c": [\n    true\n  ]\n}\n'
 
 
-def test_versions_are_of_python_too():
-    assert version.versions()["python"] == platform.python_version()
-
-
 def test_64_bits_are_named_before_a_checkpoint_is(tmp_path):
     with jax.enable_x64(True), pytest.raises(ConfigError, match=r"^JAX_ENABLE_X64 = True"):
         rundir.load(tmp_path)
 
 
-def test_runs_of_one_second_get_directories_of_their_own(tmp_path):
+def test_runs_of_one_second_get_directories_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(rundir, "datetime", SimpleNamespace(now=lambda: datetime(2026, 11, 29)))
     with ThreadPoolExecutor(8) as executor:
-        made = list(executor.map(lambda _: rundir.unused(tmp_path / "runs" / "now"), range(8)))
-    assert sorted(path.name for path in made) == ["now", *(f"now-{i}" for i in range(2, 9))]
+        made = list(executor.map(lambda _: rundir.dated("a"), range(8)))
+    name = "20261129-000000-a"
+    assert sorted(path.name for path in made) == [name, *(f"{name}-{i}" for i in range(2, 9))]
 
 
-def test_a_directory_that_cannot_be_made_is_named(tmp_path):
-    (tmp_path / "runs").write_text("a file", encoding="utf-8")
-    with pytest.raises(ConfigError, match="runs/now': cannot be made"):
-        rundir.unused(tmp_path / "runs" / "now")
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda runs: runs.write_text("a file"),
+        pytest.param(
+            lambda runs: runs.symlink_to(runs.with_name("unmounted")),
+            marks=pytest.mark.skipif(sys.platform == "win32", reason="has no links for everybody"),
+        ),
+    ],
+)
+def test_a_directory_that_cannot_be_made_is_named(tmp_path, monkeypatch, change):
+    monkeypatch.chdir(tmp_path)
+    change(tmp_path / "runs")
+    for path in (None, Path("runs/run")):
+        with (
+            pytest.raises(ConfigError, match=r"out = 'runs.*': cannot be written"),
+            rundir.begun(path, "demo"),
+        ):
+            pass
 
 
 def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
@@ -54,7 +69,7 @@ def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
         assert read_settings(run.path / "config.json") == SETTINGS
         (path / "config.json").unlink()  # as if the first one had not yet come so far
         with (
-            pytest.raises(ConfigError, match="is being written by another process"),
+            pytest.raises(ConfigError, match="another process is writing to it"),
             RunDirectory.create(path, SETTINGS),
         ):
             pass
@@ -70,11 +85,13 @@ def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
         pass
 
 
-def test_a_directory_of_somebody_gets_no_lock(tmp_path):
-    (tmp_path / "thesis.txt").write_text("precious", encoding="utf-8")
+@pytest.mark.parametrize("name", ["thesis.txt", ".config.json.d/.notes.unfinished"])
+def test_a_directory_of_somebody_gets_no_lock(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("precious", encoding="utf-8")
     with pytest.raises(ConfigError, match="is not empty"), RunDirectory.create(tmp_path, SETTINGS):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / name]
 
 
 @pytest.mark.parametrize("opens", [resumable, rundir.load])
@@ -99,31 +116,6 @@ def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
         run.append_metrics(stage="jmvae", step=2)
     lines = (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["step"] for line in lines] == [1, 2]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no symbolic links for everybody")
-def test_a_place_that_is_not_there_any_more_is_named(tmp_path):
-    (tmp_path / "runs").symlink_to(tmp_path / "unmounted")
-    with pytest.raises(ConfigError, match=r"out = '.*run': cannot be made"):
-        rundir.unused(tmp_path / "runs" / "run")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no FIFO")
-def test_a_config_that_is_no_file_is_not_read(tmp_path):
-    os.mkfifo(tmp_path / "config.json")
-    with pytest.raises(ConfigError, match="Not a regular file"):
-        read_settings(tmp_path / "config.json")
-
-
-def test_a_directory_with_something_like_an_unfinished_file_is_somebodys(tmp_path):
-    (tmp_path / ".config.json.d").mkdir()
-    (tmp_path / ".config.json.d" / ".notes.unfinished").write_text("precious")
-    with (
-        pytest.raises(ConfigError, match="is not empty"),
-        RunDirectory.create(tmp_path, Settings("smoke", 0, PRESETS["smoke"])),
-    ):
-        pass
-    assert (tmp_path / ".config.json.d" / ".notes.unfinished").exists()
 
 
 def test_steps_that_a_killed_process_has_reported_are_not_reported_again(tmp_path):
@@ -193,7 +185,7 @@ def test_a_copy_of_a_run_is_no_newer(tmp_path, monkeypatch):
     assert rundir.newest(Path("latest")) == Path("runs/newer")
 
 
-@pytest.mark.parametrize("began", [None, 3, "yesterday", "0001-01-01", "9" * 400, {}])
+@pytest.mark.parametrize("began", [None, "yesterday", "0001-01-01", {}])
 def test_without_its_time_the_file_tells_when_a_run_began(tmp_path, monkeypatch, began):
     monkeypatch.chdir(tmp_path)
     for name, changed in (("second", 2.5e9), ("first", 1e9)):
@@ -203,12 +195,11 @@ def test_without_its_time_the_file_tells_when_a_run_began(tmp_path, monkeypatch,
     assert rundir.newest(Path("latest")) == Path("runs/second")
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="has names of other letters")
-@pytest.mark.parametrize("name", [b"\xff", b"\x1b[2J", b"a\nb"])
+@pytest.mark.parametrize("name", ["\x1b[2J", "a\nb"])
 def test_a_name_that_a_terminal_would_obey_is_not_the_latest(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     plain = finish(Path("runs/plain"), "2026-11-23T19:00:25+00:00")
-    finish(Path("runs") / os.fsdecode(name), "2026-11-24T19:00:25+00:00")
+    finish(Path("runs") / name, "2026-11-24T19:00:25+00:00")
     assert rundir.newest(Path("latest")) == plain
 
 

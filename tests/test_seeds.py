@@ -11,8 +11,7 @@ from smoke import error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import evaluate, train
-from jaxsense.run import pipeline
-from jaxsense.run import seeds as of_seeds
+from jaxsense.run import pipeline, rundir
 from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory
@@ -52,7 +51,7 @@ def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
 def test_curves_are_those_of_all_seeds(seeds):
     config = read_settings(seeds / "config.json").config
     runs = [seeds / "seed-4", seeds / "seed-5"]
-    curves = of_seeds.rewards(runs, config, pytest.fail)
+    curves = rundir.rewards(runs, config, pytest.fail)
     saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "evaluation", "epsilon")}
     saved["seconds"] = np.zeros(3, np.float32)
     of_5 = Checkpoints(seeds / "seed-5" / "checkpoints").load("curves_dqn_lidar", saved)

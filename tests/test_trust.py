@@ -106,13 +106,6 @@ def test_what_the_users_own_program_names_needs_none(run, tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_that_names_no_code_needs_none(tmp_path):
-    settings = Settings("smoke", 0, PRESETS["smoke"])
-    with RunDirectory.create(tmp_path / "plain", settings) as created:
-        path = created.path
-    assert read_settings(path / "config.json") == settings
-
-
 def test_a_seed_of_several_must_have_the_settings_of_all(tmp_path, capsys):
     settings = Settings("smoke", 3, PRESETS["smoke"], num_seeds=2)
     with RunDirectory.create(tmp_path / "sweep", settings) as created:

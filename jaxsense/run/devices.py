@@ -19,24 +19,17 @@ from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 from jaxsense.run import processes
+from jaxsense.run.output import cores
 
 T = TypeVar("T")
 Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
 
 Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
-_MAX_DEVICES = 256
 _LEAST_MEMORY = 2**33  # bytes, of an accelerator
 _ALIGNED = 64  # bytes
 _PASSES_OVER_LOOPS = "while-loop-invariant-code-motion,while-loop-constant-sinking"
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    is_known = hasattr(os, "sched_getaffinity")
-    return len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
-
-
+MAX_DEVICES = 256
 NUM_THREADS = min(cores(), 8)
 """Number of threads that share work on a CPU by default."""
 
@@ -114,23 +107,8 @@ class Workers:
 ALONE = Workers()
 
 
-def check(number: int | None) -> None:
-    """Checks a number of devices before any is used.
-
-    Args:
-      number: as in `start`.
-
-    Raises:
-      ConfigError: if no machine has so many.
-    """
-    if number is not None and not 1 <= number <= _MAX_DEVICES:
-        raise ConfigError("devices", number, f"must be from 1 to {_MAX_DEVICES}")
-
-
 def start(number: int | None) -> Workers:
-    """Begins a command: sets the precision of products and XLA's threads, and selects its devices.
-
-    Both are set for the whole process, so only commands call this.
+    """Begins a command: sets the precision of products for the whole process, selects its devices.
 
     Args:
       number: of accelerators, at least one of each process, or of threads on a CPU. By default all
@@ -144,23 +122,16 @@ def start(number: int | None) -> Workers:
         a process would have none.
     """
     jax.config.update("jax_default_matmul_precision", "highest")
-    check(number)
-    wanted = number or NUM_THREADS
-    cpus = jax.config.values["jax_num_cpu_devices"]
-    with contextlib.suppress(RuntimeError):  # JAX raises it once XLA has its threads
-        jax.config.update("jax_num_cpu_devices", cpus + 2)
-        jax.config.update("jax_num_cpu_devices", cpus)
-        os.environ.setdefault("NPROC", str(max(2 * wanted, cores())))
     try:
         is_cpu = jax.default_backend() == "cpu"
     except (AssertionError, RuntimeError) as error:
         reason = f"must name devices of this machine ({str(error) or 'its plugin is missing'})"
         raise ConfigError("JAX_PLATFORMS", jax.config.values["jax_platforms"], reason) from None
     if is_cpu and jax.process_count() == 1:
-        return Workers(threads=threads(wanted))
+        return Workers(threads=threads(number or NUM_THREADS))
     owners = [device.process_index for device in jax.devices()]
     least, there = 1 + owners.index(max(owners)), len(owners)
-    number = there if number is None else number
+    number = number or there
     if not least <= number <= there:
         # All processes refuse; one that ends without the others makes them abort.
         processes.leave(processes.LEAVE_TIMEOUT)
@@ -169,14 +140,11 @@ def start(number: int | None) -> Workers:
 
 
 def threads(wanted: int = NUM_THREADS) -> int:
-    """How many programs may run side by side on a CPU: fewer than XLA's thread pool has members.
+    """How many of the `wanted` programs may run side by side on a CPU: fewer than XLA's threads.
 
-    A member of the pool splits a large batch of Cholesky decompositions, as in the physics of six
-    robots, among the pool, and waits for the others. If every member does so, all wait forever.
-    XLA reads the size from `NPROC` when it creates the backend; its default is the number of cores.
-
-    Args:
-      wanted: number of programs.
+    One of these splits a large batch of Cholesky decompositions, as in the physics of six robots,
+    among all and waits for the others. If every one did so, all would wait forever. XLA reads their
+    number from `NPROC` when it creates the backend; its default is the number of cores.
     """
     given = os.environ.get("NPROC", "")
     return min(wanted, max(1, (int(given) if given.isdecimal() else cores()) - 1))
@@ -191,56 +159,28 @@ def memory() -> int | None:
 
 
 def make_mesh(number: int | None = None) -> Mesh:
-    """A row of devices, with the axis `AXIS`.
-
-    Args:
-      number: of devices over all processes; all by default.
-
-    Raises:
-      ValueError: if there are fewer devices.
-    """
-    there = jax.devices()
-    number = len(there) if number is None else number
-    if not 1 <= number <= len(there):
-        raise ValueError(
-            f"devices = {number}: must be from 1 to {len(there)}, the number of devices"
-        )
-    return Mesh(np.array(there[:number]), (AXIS,))
+    """A row of the first devices of all processes, by default of all, with the axis `AXIS`."""
+    return Mesh(np.array(jax.devices()[:number]), (AXIS,))
 
 
 def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
-    """Shardings of arguments along their first axis.
+    """Shardings of `number` arguments along their first axis, except those at `whole`."""
+    return tuple(NamedSharding(mesh, place) for place in _places(number, whole))
 
-    Args:
-      mesh: from `make_mesh`.
-      number: of arguments.
-      whole: positions of arguments that every device gets undivided.
-    """
-    return tuple(
-        NamedSharding(mesh, PartitionSpec() if i in whole else PartitionSpec(AXIS))
-        for i in range(number)
-    )
+
+def _places(number: int, whole: tuple[int, ...]) -> tuple[PartitionSpec, ...]:
+    return tuple(PartitionSpec() if i in whole else PartitionSpec(AXIS) for i in range(number))
 
 
 def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
-    """Puts values on the device that runs programs, or on every device of a mesh.
-
-    Args:
-      values: arrays or numbers, the same in every process.
-      mesh: from `make_mesh`; None for a single device.
-    """
+    """Puts values, the same in every process, on every device of a mesh, or on the one device."""
     if mesh is None:
         return jax.device_put(values)
     return put((values,), shardings(mesh, 1, whole=(0,)))[0]
 
 
 def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[PyTree, ...]:
-    """Distributes arguments that every process has over the devices of all processes.
-
-    Args:
-      args: pytrees of arrays.
-      places: their shardings.
-    """
+    """Distributes arguments that every process has over the devices of all processes."""
 
     def put_one(x: jax.Array, place: NamedSharding) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
@@ -275,10 +215,14 @@ def spread(
         return function
 
     def partitioned(*args: PyTree) -> PyTree:
-        rows, each = PartitionSpec(AXIS), PartitionSpec()
-        places = tuple(each if i in whole else rows for i in range(len(args)))
         # The rows of devices are different, which nobody needs to check.
-        split = jax.shard_map(function, mesh=mesh, in_specs=places, out_specs=rows, check_vma=False)
+        split = jax.shard_map(
+            function,
+            mesh=mesh,
+            in_specs=_places(len(args), whole),
+            out_specs=PartitionSpec(AXIS),
+            check_vma=False,
+        )
         return split(*args)
 
     return partitioned
@@ -296,7 +240,7 @@ def side_by_side(
       function: of an index.
       number: of calls.
       threads: how many calls run at once; all by default.
-      stop: asks the calls to end, when Ctrl-C has been pressed, which waits for them.
+      stop: asks the calls to end, when one has failed or Ctrl-C has been pressed.
 
     Returns:
       The results, in order.
@@ -304,11 +248,13 @@ def side_by_side(
     if number == 1:
         return [function(0)]
     with ThreadPoolExecutor(threads or number) as executor:
-        futures = [executor.submit(function, i) for i in range(number)]
+        futures = left = [executor.submit(function, i) for i in range(number)]
         try:
-            # A wait without timeout may not notice Ctrl-C.
-            while wait(futures, timeout=0.2).not_done:
-                pass
+            while left:
+                # A wait without timeout may not notice Ctrl-C.
+                done, left = wait(left, timeout=0.2)
+                for each in done:
+                    each.result()
         except BaseException:
             stop()
             raise
@@ -318,14 +264,7 @@ def side_by_side(
 def part(
     args: tuple[PyTree, ...], i: int, number: int, whole: tuple[int, ...] = ()
 ) -> tuple[PyTree, ...]:
-    """The i-th of `number` equal parts of arguments, along their first axis.
-
-    Args:
-      args: pytrees of arrays or of their shapes; `number` divides their first axis.
-      i: index of the part.
-      number: of parts.
-      whole: positions of arguments that every part gets undivided.
-    """
+    """The i-th of `number` equal parts of arguments or their shapes, except those at `whole`."""
     if number == 1:
         return args
 
@@ -339,17 +278,10 @@ def part(
 
 
 def of_all_parts(shapes: PyTree, number: int) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes of the joined results of some parts.
-
-    Args:
-      shapes: of the results of one part.
-      number: of parts.
-    """
+    """Shapes of the joined results of parts, from those of one part."""
     if number == 1:
         return shapes
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((number * x.shape[0], *x.shape[1:]), x.dtype), shapes
-    )
+    return jax.tree.map(lambda x: x.update(shape=(number * x.shape[0], *x.shape[1:])), shapes)
 
 
 def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
@@ -362,7 +294,7 @@ def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
 def joined(
     run: Callable[[int], PyTree], number: int, threads: int, shapes: PyTree[jax.ShapeDtypeStruct]
 ) -> PyTree[np.ndarray]:
-    """Joins the results of parts, on the host if there are several.
+    """Joins the results of `run(0)`, `run(1)` and so on, on the host if there are several.
 
     Args:
       run: computes the part with an index.

@@ -1,4 +1,4 @@
-"""Atomic writes of files, and locks of directories."""
+"""Files that are written whole or not at all, and locks of directories."""
 
 import contextlib
 import errno
@@ -7,6 +7,7 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import IO
 
@@ -21,32 +22,77 @@ class WriteError(OSError):
     """A file that cannot be written."""
 
 
+@contextlib.contextmanager
+def _naming_errors(path: Path) -> Iterator[None]:
+    """Raises errors as `WriteError` with the path."""
+    try:
+        yield
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise WriteError(error.errno, reason, str(path)) from error
+
+
 def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
-    """Writes a file atomically: readers never see a part of it, even after a power failure.
+    """Replaces a file atomically: readers never see a part of it, even after a power failure.
 
     Args:
-      path: the file; an existing one is replaced.
+      path: the file.
       content: of the file; text is encoded as UTF-8.
       mode: permissions of the file, before the umask.
 
     Raises:
       WriteError: if the file cannot be written; it is then unchanged.
     """
-    unfinished = _unfinished(path)
+    with _naming_errors(path), _whole(path, Path.replace, mode) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def new(path: Path) -> AbstractContextManager[IO[bytes]]:
+    """Opens a new file, which appears under its name only once it is complete.
+
+    Raises:
+      FileExistsError: if the path exists, now or at the end.
+      OSError: if it cannot be written.
+    """
+    if path.exists():
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    return _whole(path, _name)
+
+
+@contextlib.contextmanager
+def _whole(
+    path: Path, name: Callable[[Path, Path], object], mode: int = 0o666
+) -> Iterator[IO[bytes]]:
+    """Opens a partial file, which gets its name once it is on the disk."""
+    # Unique, since another process may write the same file.
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
     try:
-        unfinished.touch(mode, exist_ok=False)
-        with unfinished.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+        partial.touch(mode, exist_ok=False)
+        with partial.open("wb") as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
-        unfinished.replace(path)
-        _sync(path.parent)
-    except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        raise WriteError(error.errno, reason, str(path)) from error
+        name(partial, path)
+        with contextlib.suppress(OSError):  # not all systems let directories be written
+            directory = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(directory)
+            finally:
+                os.close(directory)
     finally:
         with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
+            partial.unlink(missing_ok=True)
+
+
+def _name(partial: Path, path: Path) -> None:
+    """Gives a file its name; raises `FileExistsError` if the name is taken."""
+    try:
+        os.link(partial, path)
+    except FileExistsError:
+        raise
+    except OSError:  # the file system has no links
+        path.open("xb").close()
+        partial.replace(path)
 
 
 def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:
@@ -54,13 +100,22 @@ def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:
     write(path, hashlib.sha256(content).digest() + content, mode)
 
 
-def is_unfinished(path: Path, name: str | None = None) -> bool:
-    """Whether a killed `write` left this partial file.
+def without_digest(whole: bytes) -> bytes:
+    """The content that `write_digested` wrote; raises `ValueError` if it is damaged."""
+    content = whole[_DIGEST:]
+    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
+        raise ValueError("wrong digest")
+    return content
 
-    Args:
-      path: the file.
-      name: of the file that was being written; any by default.
-    """
+
+def append(path: Path, line: str) -> None:
+    """Adds a line to a text file; raises `WriteError` if it cannot be written."""
+    with _naming_errors(path), path.open("a", encoding="utf-8") as file:
+        file.write(line + "\n")
+
+
+def is_unfinished(path: Path, name: str | None = None) -> bool:
+    """Whether a killed `write` of the file `name`, or of any, left this partial file."""
     found = _PARTIAL_NAME.fullmatch(path.name)
     is_ours = found is not None and name in (None, found[1])
     return is_ours and path.is_file() and not path.is_symlink()
@@ -71,75 +126,6 @@ def remove_unfinished(directory: Path) -> None:
     for path in filter(is_unfinished, directory.iterdir()):
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-@contextlib.contextmanager
-def new(path: Path) -> Iterator[IO[bytes]]:
-    """Opens a new file, which appears under its name only once it is complete.
-
-    Args:
-      path: the file.
-
-    Raises:
-      FileExistsError: if the path exists, now or at the end.
-      OSError: if it cannot be written.
-    """
-    if path.exists():
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    unfinished = _unfinished(path)
-    try:
-        with unfinished.open("xb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        _name(unfinished, path)
-        _sync(path.parent)
-    finally:
-        with contextlib.suppress(OSError):
-            unfinished.unlink(missing_ok=True)
-
-
-def _name(unfinished: Path, path: Path) -> None:
-    """Gives a file its name; raises `FileExistsError` if the name is taken."""
-    try:
-        os.link(unfinished, path)
-    except FileExistsError:
-        raise
-    except OSError:  # the file system has no links
-        path.open("xb").close()
-        unfinished.replace(path)
-
-
-def _unfinished(path: Path) -> Path:
-    """A unique name for a partial file, since another process may write the same file."""
-    return path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
-
-
-def append(path: Path, line: str) -> None:
-    """Adds a line to a text file.
-
-    Args:
-      path: the file.
-      line: without its end.
-
-    Raises:
-      WriteError: if the file cannot be written.
-    """
-    try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(line + "\n")
-    except OSError as error:
-        raise WriteError(error.errno, error.strerror, str(path)) from error
-
-
-def _sync(directory: Path) -> None:
-    """Makes the names in a directory durable, where the system supports it."""
-    with contextlib.suppress(OSError):
-        number = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 @contextlib.contextmanager
@@ -160,25 +146,11 @@ def locked(directory: Path, on_wait: Callable[[str], None] | None = None) -> Ite
         lock.acquire(timeout=0 if on_wait is None else _WAIT_BEFORE_NOTICE)
     except filelock.Timeout:
         if on_wait is None:
-            raise BlockingIOError(f"another process holds {directory}") from None
+            reason = "another process is writing to it; wait for it to end"
+            raise BlockingIOError(errno.EAGAIN, reason, str(directory)) from None
         on_wait(f"Waiting for another process to finish writing to {directory}.")
         lock.acquire(timeout=-1)
     try:
         yield
     finally:
         lock.release()
-
-
-def without_digest(whole: bytes) -> bytes:
-    """Removes the digest from a file's content.
-
-    Args:
-      whole: the bytes that `write_digested` wrote.
-
-    Raises:
-      ValueError: if the content is damaged.
-    """
-    content = whole[_DIGEST:]
-    if hashlib.sha256(content).digest() != whole[:_DIGEST]:
-        raise ValueError("wrong digest")
-    return content

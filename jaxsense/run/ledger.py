@@ -1,9 +1,60 @@
-"""Which missions wait, play and are done, in the slots of a batch."""
+"""Which of many missions play at once: the size of their batch and chunks, and its slots."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Int
+
+from jaxsense.config import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.core import checks
+from jaxsense.mission.memory import MOST_LOOKS
+from jaxsense.mission.roadmap import VIEW_DISTANCES
+from jaxsense.run import devices
+from jaxsense.run.devices import ALONE, Workers
+
+CHUNK = math.ceil(2.5 / CONTROL_PERIOD)
+"""Control periods between two reports."""
+# Missions side by side on each thread of a CPU or on each accelerator.
+_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
+_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
+# A control step of so many missions takes an accelerator twice as long as that of a few. With T
+# missions, B of which play at once, the time is about (T / B + 1) * (1 + B / this): B squared is
+# this times T at its minimum.
+_AS_LONG_AS_NONE = 8192
+_MANY_POIS = 2**14  # of all missions; on a CPU, one takes some 3 ms of a core
+
+
+def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
+    """Number of missions side by side, below `total` since some missions last long.
+
+    A CPU holds them in its caches, an accelerator in a small part of its memory, and more the more
+    there are.
+    """
+    checks.require_number("total", total)
+    memory = devices.memory()
+    if memory is None:
+        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
+        return min(most * workers.number, -(-total // 3))
+    share = max(1, int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config))
+    pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
+    return min(total, pays, min(_MOST_OF_ACCELERATOR, share) * workers.number)
+
+
+def _bytes_of_state(config: Config) -> int:
+    """Approximate size of a mission's state: its roadmap, its robots' maps and some more."""
+    robots, num_classes = len(config.carried), len(config.arena.classes)
+    views = config.arena.num_pois * VIEW_SIDES * len(VIEW_DISTANCES)
+    nodes = config.arena.num_pois * NODES_PER_POI
+    numbers = nodes * (nodes + robots)
+    if config.mission.communication.own_maps:
+        numbers += robots * MOST_LOOKS * (robots + 2 * num_classes)
+    return 2**13 + 4 * numbers + nodes * views
+
+
+def runs_long(config: Config, total: int) -> bool:
+    """Whether `total` missions take longer than it takes to compile faster programs."""
+    return total * config.arena.num_pois >= _MANY_POIS
 
 
 class Ledger:
@@ -14,12 +65,7 @@ class Ledger:
     """
 
     def __init__(self, waiting: Sequence[Int[np.ndarray, " _"]], slots: int):
-        """Lets all missions wait.
-
-        Args:
-          waiting: for each of the P parts, its missions in order.
-          slots: S, number of slots of each part.
-        """
+        """Lets the missions of each of the P parts wait for its S slots."""
         self._missions, self._slots = waiting, slots
         self._playing = np.full((len(waiting), slots), -1)
         self._given = np.zeros(len(waiting), np.int32)  # how many have left the reserve
@@ -38,11 +84,7 @@ class Ledger:
         return bool(np.any(waits & (self._given == self._reserved_from + self._slots)))
 
     def reserve(self) -> Int[np.ndarray, " B"]:
-        """Begins a new reserve.
-
-        Returns:
-          `[P * S]` the missions to begin. Where a part has fewer, one repeats, which no slot takes.
-        """
+        """Begins a new reserve: `[P * S]` missions. Where a part has fewer, one fills the rest."""
         self._reserved_from = self._given.copy()
         rows = np.zeros_like(self._playing, np.int32)
         for part, (missions, given) in enumerate(zip(self._missions, self._given, strict=True)):
@@ -74,14 +116,7 @@ class Ledger:
         return self._playing.reshape(-1)
 
     def end(self, done: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
-        """Ends missions.
-
-        Args:
-          done: `[P * S]` whether the mission of each slot is done; idle ones do not count.
-
-        Returns:
-          The slots that are idle from now on.
-        """
+        """Ends missions in slots that are `done`; returns the slots that are idle from now on."""
         slots = np.flatnonzero(done & (self.playing >= 0))
         self._playing.reshape(-1)[slots] = -1
         self._left -= len(slots)

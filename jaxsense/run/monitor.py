@@ -76,20 +76,14 @@ class Monitor:
           listener: receives progress.
           warn: receives a line about a failure that does not end the run.
         """
-        self._lock = threading.Lock()
-        self._stop = threading.Event()
+        self._lock, self._stop = threading.Lock(), threading.Event()
         self.warn, self.stopwatch = warn, Stopwatch()
         self.begin(listener)
 
     def begin(self, listener: Listener) -> None:
         """Begins another run: forgets a failure and replaces the listener."""
         self._failure: Exception | None = None
-        self._one_listener = listener
-
-    def _listener(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        """Calls the listener, for one stage at a time."""
-        with self._lock:
-            self._one_listener(stage, done, total, metrics)
+        self._listener = listener
 
     def stop(self) -> None:
         """Asks the stages to save their training and stop."""
@@ -104,67 +98,36 @@ class Monitor:
         """Whether the stages must stop."""
         return self._stop.is_set() or self._failure is not None
 
-    def wait_for(self, future: Future[T]) -> T:
-        """The result of a future, once it is there.
-
-        Args:
-          future: of something that runs in another thread.
-
-        Raises:
-          Stopped, Exception: see `check_stop`.
-        """
-        while not future.done():
-            self.check_stop()
-            wait((future,), timeout=0.2)
-        return future.result()
-
     def check_stop(self) -> None:
-        """Checks whether the run continues.
-
-        Raises:
-          Stopped: if it was asked to stop.
-          Exception: that of a stage which has failed.
-        """
+        """Raises the error of a failed stage, or `Stopped` if the run was asked to stop."""
         if self._failure is not None:
             raise self._failure
         if self._stop.is_set():
             raise Stopped
 
+    def wait_for(self, future: Future[T]) -> T:
+        """The result of a future of another thread; raises as `check_stop` does meanwhile."""
+        while not future.done():
+            self.check_stop()
+            wait((future,), timeout=0.2)
+        return future.result()
+
     def announce(self, stage: str) -> None:
         """Reports that a stage is compiling."""
-        self._listener(stage, 0, 0, {})
+        self.progress(stage, 0, 0)
 
-    def progress(self, stage: str, done: int, total: int) -> None:
-        """Reports progress of a stage without a loss.
-
-        Args:
-          stage: its name.
-          done: units of work so far.
-          total: units of work of the whole stage.
-        """
-        self._listener(stage, done, total, {})
+    def progress(self, stage: str, done: int, total: int, **metrics: float) -> None:
+        """Reports how many units of work of a stage are done, of how many; one stage at a time."""
+        with self._lock:
+            self._listener(stage, done, total, metrics)
 
     def check_finite(self, stage: str, name: str, values: PyTree) -> None:
-        """Checks that values are finite.
-
-        Args:
-          stage: its name.
-          name: of the values, for example "results".
-          values: a pytree of arrays.
-
-        Raises:
-          StageError: if any is not; names the stage and the values.
-        """
+        """Raises `StageError` with the stage and the name of values if any is not finite."""
         if not is_finite(values):
             raise StageError(f"{stage}: {name} are not finite")
 
     def report(
-        self,
-        stage: str,
-        done: int,
-        total: int,
-        losses: np.ndarray,
-        **metrics: float,
+        self, stage: str, done: int, total: int, losses: np.ndarray, **metrics: float
     ) -> None:
         """Reports a chunk of training.
 
@@ -183,4 +146,4 @@ class Monitor:
         if len(bad):
             step = done - len(losses) + bad[0] + 1
             raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
-        self._listener(stage, done, total, {"loss": float(np.mean(losses)), **metrics})
+        self.progress(stage, done, total, loss=float(np.mean(losses)), **metrics)

@@ -1,4 +1,4 @@
-"""The standard streams of a command, which may be closed or full, and its exit status."""
+"""The process of a command: its threads, signals, standard streams and exit status."""
 
 import atexit
 import contextlib
@@ -6,20 +6,27 @@ import errno
 import gc
 import io
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import FrameType
 
 INTERRUPTED = 130  # exit status, as in shells
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NO_MEMORY = "RESOURCE_EXHAUSTED"
 _RARELY = 100_000, 50, 50  # see `gc.set_threshold`
 
 
-def run(main: Callable[[], None]) -> None:
-    """Runs a command; ends the process if it exits, and without a traceback at Ctrl-C.
+def cores() -> int:
+    """Number of cores that this process may use."""
+    is_known = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if is_known else os.cpu_count() or 1
 
-    Args:
-      main: the command.
-    """
+
+def run(main: Callable[[], None]) -> None:
+    """Runs a command; ends the process if it exits, and without a traceback at Ctrl-C."""
+    # XLA, which no command has used yet, needs more threads than run programs: `devices.threads`.
+    os.environ.setdefault("NPROC", str(2 * cores()))
     # Tracing makes and drops millions of small objects; by default, looking for circles among them
     # takes a sixth of its time. Modules stay.
     gc.freeze()
@@ -51,15 +58,41 @@ def run(main: Callable[[], None]) -> None:
         os._exit(status)  # any other exit would wait for compiling threads
 
 
-def tell(text: str) -> None:
-    """Prints the result of a command.
+@contextlib.contextmanager
+def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
+    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one aborts the process.
 
-    Args:
-      text: the result.
-
-    Raises:
-      SystemExit: with status 1, after a line to standard error, if it cannot be printed.
+    Enter it in the main thread, where Python handles signals.
     """
+    # Signals that the parent process made this one ignore stay ignored.
+    before = {
+        number: handler
+        for number in _SIGNALS
+        if (handler := signal.getsignal(number)) is not signal.SIG_IGN
+    }
+
+    def end(number: int, frame: FrameType | None) -> None:
+        # Any other exit would wait for threads that compile or save.
+        with contextlib.suppress(OSError):
+            os.write(2, b"Aborted; earlier checkpoints are intact.\n")
+        os._exit(128 + number)
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        for each in before:
+            signal.signal(each, end)
+        stop()
+
+    for number in before:
+        signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def tell(text: str) -> None:
+    """Prints the result of a command; if it cannot be printed, exits with status 1 and a line."""
     try:
         if sys.stdout is None:  # closed before the process began
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))

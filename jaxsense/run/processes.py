@@ -3,7 +3,6 @@
 import socket
 import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import Future, wait
 
 import jax
@@ -11,16 +10,14 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from jaxsense.config import ConfigError
+from jaxsense.run.output import say
 
 _JOIN_TIMEOUT = 300.0  # s
 LEAVE_TIMEOUT = 10.0  # s
 
 
 def join(
-    coordinator: str | None,
-    number: int | None,
-    index: int | None,
-    begins: Callable[[], None] = lambda: None,
+    coordinator: str | None, number: int | None, index: int | None, *, quiet: bool = False
 ) -> None:
     """Joins the processes that share a run; does nothing without arguments.
 
@@ -30,22 +27,19 @@ def join(
       coordinator: `HOST:PORT` of the first process, which listens at this address only.
       number: of processes.
       index: of this process, from 0.
-      begins: called after the arguments are validated, before waiting for the others.
+      quiet: whether not to say that it waits.
 
     Raises:
       ConfigError: if only some arguments are given, if a value is wrong, or if the others do not
         come within five minutes.
     """
     given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
-    if set(given.values()) == {None}:
+    if coordinator is None or number is None or index is None:
+        there = {name: value for name, value in given.items() if value is not None}
+        missing = " and ".join(f"--{x.replace('_', '-')}" for x in given if x not in there)
+        for name, value in there.items():
+            raise ConfigError(name, value, f"also needs {missing}")
         return
-    if missing := [name for name, value in given.items() if value is None]:
-        name, value = next((name, value) for name, value in given.items() if value is not None)
-        others = " and ".join(f"--{other.replace('_', '-')}" for other in missing)
-        raise ConfigError(name, value, f"also needs {others}")
-    assert coordinator is not None
-    assert number is not None
-    assert index is not None
     host, _, port = coordinator.rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
         reason = "must be HOST:PORT, with a port from 1 to 65535"
@@ -54,12 +48,12 @@ def join(
         raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
         raise ConfigError("process_index", index, f"must be from 0 to {number - 1}")
-    host, port = host.strip("[]"), int(port)
     try:
-        socket.getaddrinfo(host, port)
+        socket.getaddrinfo(host.strip("[]"), port)
     except OSError as error:
         raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
-    begins()
+    if not quiet:
+        say(f"Waiting for the other processes at {coordinator}.")
     joined: Future[None] = Future()
 
     def initialise() -> None:
@@ -77,8 +71,6 @@ def join(
             joined.set_exception(error)
 
     end = time.monotonic() + _JOIN_TIMEOUT
-    if index > 0:
-        _wait_for_listener(host, port, end)
     # A signal is not noticed in the thread that waits within JAX.
     threading.Thread(target=initialise, daemon=True).start()
     while not joined.done() and time.monotonic() < end:
@@ -91,19 +83,6 @@ def join(
     except (RuntimeError, ValueError) as error:
         reason = f"cannot be joined ({str(error).splitlines()[0]})"
         raise ConfigError("coordinator", coordinator, reason) from None
-
-
-def _wait_for_listener(host: str, port: int, end: float) -> None:
-    """Waits until the first process listens, or raises `ConfigError` at `end`, in monotonic s."""
-    while True:
-        try:
-            socket.create_connection((host, port), timeout=1.0).close()
-            return
-        except OSError as error:
-            if time.monotonic() > end:
-                expected = f"the first process does not listen ({error.strerror or error})"
-                raise ConfigError("coordinator", f"{host}:{port}", expected) from None
-            time.sleep(0.2)
 
 
 def of_first_process(values: np.ndarray) -> np.ndarray:

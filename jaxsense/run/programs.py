@@ -18,7 +18,7 @@ from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import Policy, Values
-from jaxsense.run import batches, films, missions
+from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.sim.world import make_world
@@ -126,14 +126,11 @@ class Programs:
                 self.player.set_exception(error)
 
     def _compile_missions(self) -> None:
-        config, workers = self.config, self._workers
+        config = self.config
         with self._compiler.monitor.stopwatch.measure("compile_s", "mission"):
             scenario = mission.make_mission(config, self._policies)
         number = len(config.mission.policies) * config.mission.episodes
-        batch = batches.batch_of(config, number, workers)
-        batch = max(batch, min(number, films.AT_A_TIME * workers.number))  # those to record
-        runs_long = batches.runs_long(config, number)
-        player = missions.Player(scenario, self._compiler, batch, workers, runs_long)
+        player = missions.Player(scenario, self._compiler, number, self._workers)
         self.player.set_result(player)
 
     def _compile(self, stage: Stage, inputs: dict[str, Output]) -> Output:

@@ -1,30 +1,32 @@
-"""Run directories: creates, resumes and reads them."""
+"""Run directories, of one seed or of several: creates, resumes and reads them."""
 
 import contextlib
+import dataclasses
 import functools
 import io
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
 from typing import cast
 
 import jax
+import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, parse_json, require_32_bits
-from jaxsense.config.options import command
 from jaxsense.core import inside
 from jaxsense.models import Models
-from jaxsense.run import devices, files, version
+from jaxsense.run import files, output, version
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.settings import Settings, as_json, began, of_run, resumable
+from jaxsense.run.settings import Settings, as_json, began, of_run, read_settings, resumable
 from jaxsense.summary.blocks import Made, Origin
 from jaxsense.summary.compare import UNKNOWN
 from jaxsense.summary.read import ORIGINS, read_made
-from jaxsense.tasks.pretrained import PREFIX, PRETRAINED, load_pretrained
+from jaxsense.tasks.pretrained import PREFIX, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
@@ -63,16 +65,12 @@ class RunDirectory:
           ConfigError: if the directory is not empty, cannot be written, or is locked by another
             process.
         """
-        with contextlib.ExitStack() as kept:
-            path = kept.enter_context(begun(path, settings.preset))
-            try:
-                kept.enter_context(_locked(path, "out"))
-                run = cls(path, settings)
+        with begun(path, settings.preset) as place, _locked(place, "out"):
+            run = cls(place, settings)
+            with _writable(place, "out"):
                 run._remove_partial()
-                _check_empty(path)  # once more: another process may have been faster
-                write_json(path / "config.json", as_json(settings))
-            except OSError as error:
-                raise _unwritable(path, error) from None
+                _check_empty(place)  # once more: another process may have been faster
+                write_json(place / "config.json", as_json(settings))
             try:
                 yield run
             except (ConfigError, KeyboardInterrupt):
@@ -84,10 +82,6 @@ class RunDirectory:
     def resume(cls, path: Path, trust: bool = False) -> "Iterator[RunDirectory]":
         """Opens the directory of a stopped run, and locks it for this process.
 
-        Args:
-          path: the directory.
-          trust: see `resumable`.
-
         Raises:
           ConfigError: see `resumable`; also if another process locks the directory.
         """
@@ -95,12 +89,39 @@ class RunDirectory:
         with _locked(path, "resume"):
             run = cls(path, settings)
             run._remove_partial()
-            run.checkpoints.check(is_begun=(path / _METRICS).exists())
             run._made = read_made(path)
             if not run._made and (path / "checkpoints").exists():
                 run._made = [{**UNKNOWN, "stage": "earlier stages"}]
             run._read_metrics()
             yield run
+
+    @property
+    def seeds(self) -> dict[int, Path]:
+        """The directory of each seed; raises `OSError` if one leads out of the run."""
+        if self.settings.num_seeds == 1:
+            return {self.settings.seed: self.path}
+        return {n: inside.place(self.path / f"seed-{n}", self.path) for n in self.settings.seeds}
+
+    def check_seeds(self) -> None:
+        """Raises `ConfigError` if the directory of a seed holds another run."""
+        for seed, path in self.seeds.items():
+            if path == self.path or not (path / "config.json").exists():
+                continue
+            # The settings are only compared: no custom sensor is made.
+            if read_settings(path / "config.json", trust=True) != self._settings_of(seed):
+                reason = f"must have the settings of {self.path / 'config.json'}, with seed {seed}"
+                raise ConfigError("resume", str(path), reason)
+
+    def of_seed(self, seed: int, path: Path) -> "AbstractContextManager[RunDirectory]":
+        """Opens the directory of a seed, the same as if that seed were trained alone."""
+        if path == self.path:
+            return contextlib.nullcontext(self)
+        if (path / "config.json").exists():
+            return RunDirectory.resume(path, trust=True)
+        return RunDirectory.create(path, self._settings_of(seed))
+
+    def _settings_of(self, seed: int) -> Settings:
+        return dataclasses.replace(self.settings, seed=seed, num_seeds=1)
 
     def append_metrics(self, *, stage: str, step: int, **metrics: float) -> None:
         """Adds a line to `metrics.jsonl`, unless this run wrote it before it was killed.
@@ -109,9 +130,6 @@ class RunDirectory:
           stage: that reports.
           step: number of steps so far.
           **metrics: after that step.
-
-        Raises:
-          WriteError: if the file cannot be written.
         """
         if step > self._reported.get(stage, -1):
             line = json.dumps({"stage": stage, "step": step, **metrics})
@@ -161,38 +179,18 @@ class RunDirectory:
                 self._reported[stage] = max(step, self._reported.get(stage, -1))
 
 
-def unused(path: Path) -> Path:
-    """Makes a new directory, with a number after its name if the name is taken.
-
-    Args:
-      path: the directory.
-
-    Returns:
-      The directory made.
-
-    Raises:
-      ConfigError: if it cannot be made.
-    """
-    found, number = path, 1
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        while True:
-            with contextlib.suppress(FileExistsError):
-                found.mkdir()
-                return found
-            number += 1
-            found = path.with_name(f"{path.name}-{number}")
-    except OSError as error:
-        raise ConfigError("out", str(path), f"cannot be made ({error.strerror})") from None
-
-
 def dated(name: str) -> Path:
-    """Makes a new directory `runs/DATE-TIME-NAME`, see `unused`.
-
-    Args:
-      name: what is in it.
-    """
-    return unused(Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}")
+    """Makes a new directory `runs/DATE-TIME-NAME`, with a number after it if that is taken."""
+    first = path = Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{name}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    number = 1
+    while True:
+        try:
+            path.mkdir()
+            return path
+        except FileExistsError:
+            number += 1
+            path = first.with_name(f"{first.name}-{number}")
 
 
 @contextlib.contextmanager
@@ -206,13 +204,11 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
     Raises:
       ConfigError: if the directory is not empty or cannot be made.
     """
-    try:
+    with _writable(path or Path("runs"), "out"):
         is_new = path is None or not path.exists()
         path = path or dated(name)
         path.mkdir(parents=True, exist_ok=True)
         _check_empty(path)
-    except OSError as error:
-        raise _unwritable(path, error) from None
     try:
         yield path
     finally:
@@ -221,10 +217,13 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
                 path.rmdir()
 
 
-def _unwritable(path: Path | None, error: OSError) -> ConfigError:
-    """The error about a directory of results that cannot be written."""
-    reason = f"cannot be written ({error.strerror}); must be a new directory"
-    return ConfigError("out", str(path), reason)
+@contextlib.contextmanager
+def _writable(path: Path, field: str) -> Iterator[None]:
+    """Raises each `OSError` as a `ConfigError` about a directory that cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
 
 
 def _check_empty(path: Path) -> None:
@@ -235,29 +234,15 @@ def _check_empty(path: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path, field: str) -> Iterator[None]:
-    """Locks a directory; raises `ConfigError` about `field` if another process holds the lock."""
+    """Locks a directory; raises `ConfigError` about `field` if that cannot be done."""
     with contextlib.ExitStack() as kept:
-        try:
+        with _writable(path, field):
             kept.enter_context(files.locked(path))
-        except BlockingIOError:
-            reason = "is being written by another process; wait for it to end"
-            raise ConfigError(field, str(path), reason) from None
-        except OSError as error:
-            raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
         yield
 
 
 def write_json(path: Path, content: Mapping[str, object] | Sequence[object]) -> None:
-    """Writes a JSON file.
-
-    Args:
-      path: the file.
-      content: finite numbers, texts, lists and dictionaries.
-
-    Raises:
-      WriteError: if the file cannot be written.
-      ValueError: if a number is not finite.
-    """
+    """Writes finite numbers, texts, lists and dictionaries as a JSON file for people."""
     files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
@@ -272,26 +257,16 @@ def _process() -> Origin:
     found: Origin = {
         "versions": version.versions(),
         "devices": [device.device_kind for device in jax.devices()],
-        "cores": devices.cores(),
+        "cores": output.cores(),
         "source": version.SOURCE,
     }
     return {**found, "commit": commit} if (commit := version.commit()) else found
 
 
 def newest(path: Path) -> Path:
-    """Returns a path; for `latest`, that of the newest finished run in `runs/`.
-
-    Raises:
-      ConfigError: if there is no finished run, or if the models that come with jaxsense are named.
-    """
-    preset = (given := str(path)).removeprefix(PREFIX)
-    is_pretrained = preset != given or preset in PRETRAINED
-    if not (is_pretrained or given == "latest") or path.exists():
+    """A path; for `latest`, that of the newest finished run in `runs/`."""
+    if str(path) != "latest" or path.exists():
         return path
-    if is_pretrained:
-        reason = f"must be the directory of a finished run; {PREFIX}{preset} only names models, "
-        demo = f"{command('jaxsense.demo')} --preset {preset}"
-        raise ConfigError("run", given, f"{reason}which {demo} plays")
     runs = sorted(config.parent for config in Path("runs").glob("*/config.json"))
     # Nobody could type the other names, and a terminal might obey them.
     finished = [r for r in runs if r.name.isprintable() and (r / "summary.json").exists()]
@@ -318,15 +293,11 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     require_32_bits()
     if not isinstance(path, str | Path):
         raise ConfigError("run", path, "must be a path")
-    path, given = Path(path), str(path)
-    if given.startswith(PREFIX) and not path.exists():
-        return load_pretrained(given.removeprefix(PREFIX))
-    path = newest(path)
+    if str(path).startswith(PREFIX) and not Path(path).exists():
+        return load_pretrained(str(path).removeprefix(PREFIX))
+    path = newest(Path(path))
     settings = of_run(path, trust)
-    config = settings.config
-    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    checkpoints = Checkpoints(path / "checkpoints")
-
+    config, checkpoints = settings.config, Checkpoints(path / "checkpoints")
     if not (path / "checkpoints").exists() and settings.num_seeds != 1:
         raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
 
@@ -337,8 +308,8 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
             raise ConfigError("run", str(path), reason)
         return jax.device_put(found)
 
-    found = {name: restore(name, shape) for name, shape in _named(shapes, config).items()}
-    return config, stages.models(found, config)
+    shapes = _named(jax.eval_shape(lambda: models.init(jax.random.key(0), config)), config)
+    return config, stages.models({name: restore(name, x) for name, x in shapes.items()}, config)
 
 
 def _named(models: Models, config: Config) -> dict[str, PyTree]:
@@ -354,3 +325,40 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
         **{learner(config, name): q_network for name, q_network in q_networks},
         **dict(zip(("tours",), models.tours, strict=False)),
     }
+
+
+def rewards(
+    runs: Sequence[Path], config: Config, warn: Callable[[str], None]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Reads the curves of `reward.svg` from the checkpoints of several runs.
+
+    Args:
+      runs: their directories.
+      config: their settings.
+      warn: called with a line about each checkpoint that is damaged or missing.
+
+    Returns:
+      `[K, epochs]` rewards as in `pipeline.Learned.rewards`, without those of such checkpoints.
+    """
+    epochs = config.dqn.epochs
+    shapes: dict[str, np.ndarray] = dict.fromkeys(
+        ("reward", "evaluation", "epsilon"), np.zeros(epochs, np.float32)
+    )
+    shapes["seconds"] = np.zeros(epochs // config.dqn.chunk, np.float32)
+    curves: dict[str, dict[str, np.ndarray]] = {}
+    for network in dict.fromkeys(learner(config, name) for name in config.modalities):
+        found: list[dict[str, np.ndarray]] = []
+        for run in runs:
+            directory, name = run / "checkpoints", f"curves_{network}"
+            try:
+                if curve := Checkpoints(directory).load(name, shapes):
+                    found.append(curve)
+                else:
+                    warn(f"{directory}: holds no {name}; left out of reward.svg")
+            except ConfigError as error:
+                warn(f"{error}; left out of reward.svg")
+        curves[network.removeprefix("dqn_")] = {
+            name: np.array([curve[name] for curve in found]).reshape(-1, epochs)
+            for name in ("reward", "evaluation")
+        }
+    return curves

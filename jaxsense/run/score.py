@@ -15,7 +15,7 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models, require_fitting
-from jaxsense.run import batches, devices, missions
+from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Listener, Monitor
@@ -65,6 +65,7 @@ def _ignore(stage: str, done: int, total: int, metrics: dict[str, float]) -> Non
     """Hears nothing."""
 
 
+@checks.typed
 def score_missions(
     config: Config,
     models: Models,
@@ -113,10 +114,8 @@ def score_missions(
         scenario = make_mission(config, own)
         known = cases(config, scenario.policies)
         played = {name: known[name] for name in dict.fromkeys((*policies, *against))}
-        number, workers = episodes * len(played), _workers()
-        batch = batches.batch_of(config, number, workers)
-        runs_long = batches.runs_long(config, number)
-        player = missions.Player(scenario, compiler, batch, workers, runs_long, models)
+        total = episodes * len(played)
+        player = missions.Player(scenario, compiler, total, _workers(), models)
         found = player.play(jax.random.key(seed), models, played, episodes)
     return _score(config, found.metrics, against[0])
 
@@ -144,32 +143,28 @@ def _require(
     seed: int,
 ) -> None:
     """Checks the arguments of `score_missions`, before anything is compiled."""
+
+    def require(is_right: bool, field: str, value: object, expected: str) -> None:
+        if not is_right:
+            raise ConfigError(field, value, expected)
+
     checks.require_number("episodes", episodes)
-    if episodes > MAX_EPISODES:
-        raise ConfigError("episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
+    is_few = episodes <= MAX_EPISODES
+    require(is_few, "episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
     is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not is_whole or not 0 <= seed < 2**32:
-        raise ConfigError("seed", seed, "must be a whole number from 0 to 2^32 - 1")
-    if not isinstance(config, Config):
-        raise ConfigError("config", type(config), "must be Config, as from load_pretrained")
-    if not isinstance(models, Models):
-        raise ConfigError("models", type(models), "must be Models, as from load_pretrained")
-    if not isinstance(policies, Mapping):
-        raise ConfigError("policies", policies, "must be a dictionary from names to policies")
+    is_seed = is_whole and 0 <= seed < 2**32
+    require(is_seed, "seed", seed, "must be a whole number from 0 to 2^32 - 1")
     for name, each in policies.items():
-        if not isinstance(name, str):
-            raise ConfigError("policies", name, "must be a text, the name of a policy")
-        if not callable(each) and not isinstance(each, Policy):
-            raise ConfigError("policies", name, "must be a function or a dqn.Policy")
-    names = (*POLICIES, *policies)
-    is_list = isinstance(against, list | tuple)
-    if not is_list or not against or any(x not in names for x in against):
-        reason = f"must be a list of one or more of {', '.join(dict.fromkeys(names))}"
-        raise ConfigError("against", against, reason)
+        is_policy = callable(each) or isinstance(each, Policy)
+        require(is_policy, "policies", name, "must be a function or a dqn.Policy")
+    names = dict.fromkeys((*POLICIES, *policies))
+    is_list = isinstance(against, list | tuple) and bool(against)
+    is_known = is_list and all(name in names for name in against)
+    require(is_known, "against", against, f"must be a list of one or more of {', '.join(names)}")
     checks.require_one_each("models.detectors", models.detectors, config.modalities)
-    if not models.agent.plays(config.arena.num_pois):
-        reason = "must be the number of PoIs that the models were trained with"
-        raise ConfigError("arena.num_pois", config.arena.num_pois, reason)
+    number = config.arena.num_pois
+    reason = "must be the number of PoIs that the models were trained with"
+    require(models.agent.plays(number), "arena.num_pois", number, reason)
     require_fitting(config, models)
 
 

@@ -218,7 +218,7 @@ def test_all_cores_take_part_in_the_first_row():
 import jax
 from benchmarks import ROWS, __main__
 from benchmarks.measure import Row
-from jaxsense.run import devices
+from jaxsense.run import devices, output
 
 devices.cores = lambda: 2
 
@@ -228,7 +228,7 @@ def row(options):
     return Row("jmvae", "samples/s", 1.0, 0.0, 1)
 
 ROWS["jmvae"] = row
-__main__.main(["jmvae"])
+output.run(lambda: __main__.main(["jmvae"]))
 """
     environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
     command = [sys.executable, "-c", code]

@@ -13,7 +13,7 @@ from teams import CONFIG, NAIVE, with_config
 from jaxsense import mission
 from jaxsense.core.types import Belief
 from jaxsense.mission.state import Record
-from jaxsense.run import batches, devices, missions
+from jaxsense.run import devices, ledger, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor, StageError
@@ -21,7 +21,7 @@ from jaxsense.run.monitor import Monitor, StageError
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK = batches.CHUNK
+CHUNK = ledger.CHUNK
 SHORT = dataclasses.replace(CONFIG.mission, time_limit=30.0)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
@@ -75,6 +75,7 @@ def play(team, models, begun, players, monkeypatch):
         monkeypatch.setattr(ROLLOUT, "step", step)
         monkeypatch.setattr(missions, "reset", fake_reset)
         monkeypatch.setattr(missions, "measure", measure)
+        monkeypatch.setattr(missions, "batch_of", lambda *_: batch)
         with Compiler(Monitor()) as compiler:
             player = missions.Player(team, compiler, batch, WORKERS[split]())
             waited = []
@@ -175,12 +176,13 @@ def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play):
 
 
 @pytest.mark.slow  # the physics of two batch sizes is compiled
-def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, models):
+def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, models, monkeypatch):
     short = with_config(team, dataclasses.replace(CONFIG, mission=SHORT))
     every = mission.cases(CONFIG)
     cases = {name: every[name] for name in ("latent", "naive")}
 
     def play(batch, split="one device"):
+        monkeypatch.setattr(missions, "batch_of", lambda *_: batch)
         with Compiler(Monitor()) as compiler:
             player = missions.Player(short, compiler, batch, WORKERS[split]())
             return player.play(KEY, models, cases, episodes=32)

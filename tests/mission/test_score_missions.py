@@ -50,7 +50,7 @@ def play(team, models, monkeypatch):
     asked = {}
 
     class Player:
-        def __init__(self, team, compiler, batch, workers, runs_long, models):
+        def __init__(self, team, compiler, total, workers, models):
             asked["team"] = team
 
         def play(self, key, models, played, episodes):
