@@ -19,6 +19,7 @@ from jaxsense.looks import make_mdp
 from jaxsense.models import init
 
 LIDAR, NOP = 1, 3
+SMOKE = jaxsense.PRESETS["smoke"]
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def params(env):
 
 
 def test_params_say_when_an_episode_is_truncated(env, params):
-    assert params.max_steps_in_episode == small.CONFIG.mdp.max_steps
+    assert params.max_steps_in_episode == small.small_mdp().config.max_steps
     params = params.replace(max_steps_in_episode=2)
     _, state = env.reset(jax.random.key(0), params)
     cases = [(0, False, False), (0, False, True), (0, False, False), (NOP, True, False)]
@@ -87,7 +88,7 @@ def test_every_task_is_registered(env):
 @pytest.mark.slow
 def test_live_observations_trace():
     def play(key):
-        env = MapEnv(make_mdp(small.CONFIG, init(key, small.CONFIG)).map, 0)
+        env = MapEnv(make_mdp(SMOKE, init(key, SMOKE)).map, 0)
         _, state = env.reset(key, env.default_params)
         return env.step(key, state, 0, env.default_params)
 

@@ -11,8 +11,7 @@ import small
 
 import jaxsense.interfaces
 
-AGENTS = ["camera_1", "camera_2", "lidar"]
-NOP = 4
+AGENTS, NOP = [*small.AGENTS], small.TEAM_NOP
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +32,12 @@ def test_agents_and_spaces_are_those_of_the_robots(env):
     assert isinstance(env, MultiAgentEnv)
     assert (env.num_agents, env.agents) == (3, AGENTS)
     assert env.agent_classes == {"camera": ["camera_1", "camera_2"], "lidar": ["lidar"]}
-    # Mean, deviation (2 each), time, 3 for each of 2 modalities, presence and place: 14 of 4 PoIs.
+    # Mean, deviation (2 each), time, 3 for each of 2 modalities, presence and place: 14 of 8 PoIs.
     observations, state = env.reset(jax.random.key(0))
     available = env.get_avail_actions(state)
     for agent in AGENTS:
         space = env.observation_space(agent)
-        assert space.shape == observations[agent].shape == (14 * 4,)
+        assert space.shape == observations[agent].shape == (14 * 8,)
         assert space.dtype == observations[agent].dtype == jnp.float32
         assert env.action_space(agent).n == NOP + 1
         assert available[agent].shape == (NOP + 1,)
@@ -80,7 +79,7 @@ def test_it_scans_in_a_batch_and_equals_one_alone(env):
     third = jax.tree.map(lambda x: x[2], together)
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), third, alone)
     observations, rewards, dones, infos = together
-    assert observations["lidar"].shape == (4, 24, 56)
+    assert observations["lidar"].shape == (4, 24, 112)
     assert infos["seconds"].shape == (4, 24, 3)
     # 24 steps of at most 12 each: every environment ended at least once.
     assert dones["__all__"].any(axis=1).all()

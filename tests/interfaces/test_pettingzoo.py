@@ -14,8 +14,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 
 from jaxsense.interfaces.pettingzoo import TeamAECEnv, TeamParallelEnv, make, make_parallel
 
-AGENTS = ["camera_1", "camera_2", "lidar"]
-NOP = 4
+AGENTS, NOP = [*small.AGENTS], small.TEAM_NOP
 OWN = (
     lambda: TeamAECEnv(small.team(), small.TEAM),
     lambda: TeamParallelEnv(small.team(), small.TEAM),
@@ -77,7 +76,7 @@ def test_a_turn_takes_actions_of_its_robot_only():
     with pytest.raises(ResetNeeded):
         turns.step(0)
     turns.reset(seed=0)
-    for action in (5, -1, 0.5, None):
+    for action in (9, -1, 0.5, None):
         with pytest.raises(ValueError, match=rf"action = {action}: must be in Discrete"):
             turns.step(action)
     for agent, kind in zip(AGENTS, (int, np.uint8, jnp.int32), strict=True):

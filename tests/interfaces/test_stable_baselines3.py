@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import small
 
 pytest.importorskip("stable_baselines3", reason="stable_baselines3: needs the extra jaxsense[sb3]")
 
@@ -12,7 +11,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import jaxsense
-from jaxsense.interfaces.gymnasium import MapVectorEnv, make_vec
+from jaxsense.interfaces.gymnasium import make_vec
 from jaxsense.interfaces.stable_baselines3 import MapVecEnv
 
 
@@ -77,4 +76,4 @@ def test_attributes_are_those_of_the_whole_and_masks_those_of_each():
 
 def test_only_episodes_that_start_again_in_the_same_step_are_taken():
     with pytest.raises(ValueError, match=r"autoreset_mode = .*must be AutoresetMode\.SAME_STEP"):
-        MapVecEnv(MapVectorEnv(small.small_mdp(), 0, 2))
+        MapVecEnv(make_vec("map-v0", 2))
