@@ -100,7 +100,7 @@ def options_of(base: object, name: str = "--", path: tuple[str, ...] = ()) -> It
     section = base if isinstance(base, type) else type(base)
     kinds, marked = get_type_hints(section), get_type_hints(section, include_extras=True)
     prefix = name if name == "--" else f"{name}."
-    for field in (each.name for each in dataclasses.fields(section)):
+    for field in (each.name for each in dataclasses.fields(cast(Any, section))):
         default = getattr(base, field, _REQUIRED)
         own = next((mark for mark in get_args(marked[field]) if isinstance(mark, Name)), None)
         inside, to = own or prefix + field.replace("_", "-"), (*path, field)

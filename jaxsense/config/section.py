@@ -178,8 +178,9 @@ def check_fields(section: object, bits: int = 31) -> None:
         numbers = value if isinstance(value, tuple) else (value,)
         fits = all(abs(each) < 2**bits for each in numbers if isinstance(each, int))
         require(fits, section, name, f"must be below 2^{bits}")
-        is_dict = isinstance(value, FrozenDict)
-        parts = {f"{place}.{n}": x for n, x in value.items()} if is_dict else {place: value}
+        parts = {place: value}
+        if isinstance(value, FrozenDict):
+            parts = {f"{place}.{n}": x for n, x in value.items()}
         for each, x in parts.items():
             if limits is not None and not limits.allow(x):
                 raise ConfigError(each, x, limits.expected(x))
