@@ -15,8 +15,9 @@ from jaxsense.config import DqnConfig
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
 from jaxsense.dqn import training
-from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.team_agent import TeamAgent
+from jaxsense.dqn.training import Environment
 from jaxsense.run import devices
 from jaxsense.tasks.score import Policy
 
@@ -79,8 +80,10 @@ class Dqn:
 
     def train(self, task: tasks.Task, seeds: Sequence[int], steps: int) -> dict[int, Policy]:
         """Trains all seeds in one program."""
-        discounts = {"step": self.discount, "second": self.discount_of_a_second}
-        agent = task.models.agent.with_discount(**discounts)
+        agent = task.models.agent
+        is_team = isinstance(agent, TeamAgent)
+        discount = self.discount_of_a_second if is_team else self.discount
+        agent = dataclasses.replace(agent, discount=discount)
         epochs = max(1, steps // self.num_envs)
         settings = DqnConfig(
             num_envs=self.num_envs,

@@ -19,7 +19,7 @@ from benchmarks.peers import native
 from jaxsense import Config, init, mission
 from jaxsense.config import CONTROL_PERIOD
 from jaxsense.mission import Mission, MissionState, navigation
-from jaxsense.mission.motion import move
+from jaxsense.mission.rollout import move
 from jaxsense.mission.rollout import step as mission_step
 from jaxsense.run import devices
 from jaxsense.run.devices import Workers

@@ -18,9 +18,8 @@ from benchmarks.measure import Options, Row
 from jaxsense import PRESETS, init, learn
 from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
 from jaxsense.dqn import episodes, policies, training
-from jaxsense.dqn.episodes import Start
+from jaxsense.dqn.episodes import Start, reference
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.reference import reference
 from jaxsense.run import devices
 
 _LONGEST = 60.0  # s that we may take

@@ -26,10 +26,9 @@ from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
-from jaxsense.dqn.team_mdp import Team
-from jaxsense.dqn.travel import Travel
+from jaxsense.dqn.team_mdp import Team, Travel
 from jaxsense.interfaces.common import extra
-from jaxsense.mission import maps, memory
+from jaxsense.mission import maps
 from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
 from jaxsense.models import Models, make_agent, make_jmvae
@@ -157,7 +156,7 @@ def _write(config: Config, m: int, own_maps: bool) -> Function:
 
 def _merge(models: Models, sums: jax.Array) -> Arrays:
     """A robot's map, from what each robot has said of its own looks."""
-    of_poi = jax.vmap(lambda total: memory.belief_of(models.fusion, total))
+    of_poi = jax.vmap(lambda total: maps.belief_of(models.fusion, total))
     return vars(of_poi(jnp.sum(sums, axis=0)))
 
 
@@ -296,7 +295,7 @@ def _description(config: Config, models: Models) -> dict[str, object]:
             "centre, in metres, and the largest bearing to either side, in radians",
         },
         "mission": {"attempts": ATTEMPTS},
-        "remembered_looks": memory.MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
+        "remembered_looks": maps.MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
         "versions": {"jaxsense": __version__},
     }
 

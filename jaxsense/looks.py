@@ -18,8 +18,7 @@ from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
 from jaxsense.dqn.map_mdp import Looks, MapMdp
-from jaxsense.dqn.places import Places
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.team_mdp import Places, TeamMdp
 from jaxsense.models import Models, require_fitting
 from jaxsense.sim import world as worlds
 from jaxsense.sim.domain import make_domain

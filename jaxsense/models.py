@@ -13,9 +13,9 @@ from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
-from jaxsense.dqn.environments import Agent
 from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.policies import Agent
 from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.sim import search as searching
 from jaxsense.sim import sensors, windows

@@ -18,7 +18,7 @@ import jaxsense
 from jaxsense import Belief, evaluate, sim, train
 from jaxsense.config import PRESETS
 from jaxsense.dqn import policies
-from jaxsense.dqn.reference import reference
+from jaxsense.dqn.episodes import reference
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.training import learn, stages
 

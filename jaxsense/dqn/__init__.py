@@ -1,9 +1,8 @@
 """The shared map as a Markov decision process, and deep Q-learning on it."""
 
 from jaxsense.dqn import replay as replay
-from jaxsense.dqn.environments import MapEnvironment as MapEnvironment
-from jaxsense.dqn.environments import TeamEnvironment as TeamEnvironment
 from jaxsense.dqn.map_agent import MapAgent as MapAgent
+from jaxsense.dqn.map_agent import MapEnvironment as MapEnvironment
 from jaxsense.dqn.map_agent import observation as observation
 from jaxsense.dqn.map_mdp import Looks as Looks
 from jaxsense.dqn.map_mdp import MapMdp as MapMdp
@@ -22,8 +21,9 @@ from jaxsense.dqn.rewards import Paper as Paper
 from jaxsense.dqn.rewards import Reward as Reward
 from jaxsense.dqn.rewards import information as information
 from jaxsense.dqn.team_agent import TeamAgent as TeamAgent
+from jaxsense.dqn.team_agent import TeamEnvironment as TeamEnvironment
 from jaxsense.dqn.team_mdp import TeamMdp as TeamMdp
 from jaxsense.dqn.team_mdp import TeamState as TeamState
+from jaxsense.dqn.team_mdp import Travel as Travel
 from jaxsense.dqn.training import DqnState as DqnState
 from jaxsense.dqn.training import train as train
-from jaxsense.dqn.travel import Travel as Travel

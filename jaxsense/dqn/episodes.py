@@ -1,6 +1,7 @@
-"""Whole episodes of policies, from random starts and from every state of the map."""
+"""Whole episodes of policies from random starts and every state of the map, and the optimum."""
 
 import itertools
+import math
 import random
 from collections.abc import Callable
 from typing import Protocol, TypeVar
@@ -10,27 +11,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.core.types import Index, Key, call, pytree
-from jaxsense.dqn import map_mdp, team_mdp
+from jaxsense.core.types import Fusion, Index, Key, call, pytree
+from jaxsense.dqn import map_mdp, policies, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp, MapState
-from jaxsense.dqn.policies import Known
+from jaxsense.dqn.optimum import LookValues, steps_of_lattice
+from jaxsense.dqn.policies import Known, Trained
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState, alone
 
 M = TypeVar("M")
 
 MAX_STATES = 4096
+_NUM_DRAWS = 1024
+_AT_ONCE = 1024  # simulated looks, to save memory
+_FINE = 16  # steps of a lattice between whose points values are right to a hundredth
 
 
 class LogLikelihoods(Protocol):
     """How the exact Bayes filter reads a look; see `vae.bayes.Bayes`."""
 
     def log_likelihoods(self, features: Float[Array, " L"], modality: int) -> Float[Array, " C"]:
-        """Log-likelihood of each class given one look.
-
-        Args:
-          features: `[D_m]` probabilities of the labels.
-          modality: index of the sensor; static.
-        """
+        """Log-likelihood of each class given one look."""
         ...
 
 
@@ -39,7 +39,6 @@ class Start:
     """The first state of an episode, and what policies know besides.
 
     Attributes:
-      state: the state.
       log_likelihood: `[N, C]` logarithms of the classes' likelihoods given all earlier looks.
     """
 
@@ -54,15 +53,7 @@ def reset(
     classes: Int[Array, " N"] | None = None,
     seen: Bool[Array, "N M"] | None = None,
 ) -> Start:
-    """Starts an episode, see `map_mdp.reset`.
-
-    Args:
-      key: random key.
-      mdp: the MDP.
-      exact: the exact Bayes filter.
-      classes: see `map_mdp.reset`.
-      seen: see `map_mdp.reset`.
-    """
+    """Starts an episode, see `map_mdp.reset`."""
     state, looks = map_mdp.reset_with_looks(key, mdp, classes, seen)
     total = jnp.zeros((mdp.num_pois, mdp.num_classes))
     for m, features in enumerate(looks):
@@ -85,12 +76,7 @@ def run_episode(
     are compared on the same looks. Under `vmap` it runs until the longest episode has ended.
 
     Args:
-      key: random key.
-      mdp: the MDP.
-      exact: the exact Bayes filter, whose posterior some policies read.
       act: `(key, known) -> []` int32 action, see `policies.best`.
-      start: from `reset`.
-      modality: index of the agent's own sensor, see `map_mdp.step`.
 
     Returns:
       `[]` total reward, without discount, and `[]` reward of the first action.
@@ -114,16 +100,7 @@ def run_recurrent(
     """Plays one episode with a policy that remembers, see `run_episode`.
 
     Args:
-      key: random key.
-      mdp: the MDP.
-      exact: the exact Bayes filter.
       act: `(key, known, memory) -> []` int32 action, and the memory after it.
-      memory: before the first action.
-      start: from `reset`.
-      modality: index of the agent's own sensor.
-
-    Returns:
-      See `run_episode`.
     """
     num_pois, team = mdp.num_pois, alone(mdp.num_pois, modality)
     times = jnp.ones((1, num_pois))
@@ -131,14 +108,8 @@ def run_recurrent(
 
     def play(carry: _Carry) -> _Carry:
         state, looks = carry.state, carry.looks
-        known = Known(
-            state.belief,
-            looks[:num_pois],
-            jax.nn.log_softmax(carry.log_likelihood),
-            team,
-            times,
-            jnp.int32(0),
-        )
+        posterior = jax.nn.log_softmax(carry.log_likelihood)
+        known = Known(state.belief, looks[:num_pois], posterior, team, times, jnp.int32(0))
         policy = jax.random.fold_in(policy_key, state.steps)
         action, memory = act(policy, known, carry.memory)
         own = carry.own_looks[action]
@@ -185,87 +156,40 @@ def run_team(
     act: Callable[[Key, TeamState, Known, M], tuple[jax.Array, M]],
     memory: M,
     start: TeamState,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Plays one episode of a team, whose robots share one policy.
+) -> Float[Array, ""]:
+    """Rewards of all looks less the price of all robots' time, in one episode of a team.
 
     Args:
-      key: random key.
-      mdp: the MDP of the team.
       act: `(key, state, known, memory) -> []` int32 choice of robot `state.agent`, and the memory
         after it. What is known holds no posterior: classes are equally likely in it.
-      memory: before the first choice.
-      start: from `team_mdp.reset`.
-
-    Returns:
-      `[]` rewards of all looks less the price of all robots' time, and `[]` seconds.
     """
     policy_key, looks_key = jax.random.split(key)
     num_pois = mdp.map.num_pois
     uniform = jnp.zeros((num_pois, mdp.map.num_classes)) - jnp.log(mdp.map.num_classes)
 
-    def play(carry: _TeamCarry) -> _TeamCarry:
-        state, step = carry.state, carry.state.map.steps
+    def play(carry: tuple[TeamState, jax.Array, M, jax.Array, jax.Array]):
+        state, looks, memory, _, total = carry
+        step = state.map.steps
         times = team_mdp.travel_times(mdp.travel, state.team)
-        known = Known(state.map.belief, carry.looks, uniform, state.team, times, state.agent)
-        action, memory = act(jax.random.fold_in(policy_key, step), state, known, carry.memory)
+        known = Known(state.map.belief, looks, uniform, state.team, times, state.agent)
+        action, memory = act(jax.random.fold_in(policy_key, step), state, known, memory)
         after, outcome = team_mdp.step(jax.random.fold_in(looks_key, step), mdp, state, action)
         target = state.team.target.at[state.agent].set(action)[after.agent]
         # Choices take no time, looks do; NOP, beyond the last row, is no look.
         seconds = jnp.asarray(outcome.seconds)
         own = after.team.modality[after.agent]
-        reward = outcome.reward - mdp.time_price(after.team, seconds)
-        return _TeamCarry(
-            state=after,
-            looks=carry.looks.at[target, own].add((seconds > 0).astype(jnp.int32), mode="drop"),
-            memory=memory,
-            done=outcome.terminated | outcome.truncated,
-            total=carry.total + reward,
-        )
+        looks = looks.at[target, own].add((seconds > 0).astype(jnp.int32), mode="drop")
+        total += outcome.reward - mdp.time_price(after.team, seconds)
+        return after, looks, memory, outcome.terminated | outcome.truncated, total
 
-    begin = _TeamCarry(
-        state=start,
-        looks=start.map.seen.astype(jnp.int32),
-        memory=memory,
-        done=jnp.bool_(False),
-        total=jnp.float32(0.0),
-    )
-    end = jax.lax.while_loop(lambda carry: ~carry.done, play, begin)
-    return end.total, end.state.seconds
-
-
-@pytree
-class _TeamCarry:
-    """An episode of a team under way.
-
-    Attributes:
-      state: before a choice.
-      looks: `[N, M]` int32 looks at each PoI.
-      memory: of the policy.
-      done: `[]` bool.
-      total: `[]` return so far.
-    """
-
-    state: TeamState
-    looks: jax.Array
-    memory: PyTree
-    done: jax.Array
-    total: jax.Array
+    seen = start.map.seen.astype(jnp.int32)
+    begin = start, seen, memory, jnp.bool_(False), jnp.float32(0.0)
+    return jax.lax.while_loop(lambda carry: ~carry[3], play, begin)[4]
 
 
 @pytree
 class _Carry:
-    """An episode under way.
-
-    Attributes:
-      state: of the MDP.
-      looks: `[N + 1, M]` int32 looks at each PoI, and choices of NOP.
-      own_looks: `[N + 1]` int32 actions in this episode.
-      log_likelihood: `[N, C]` see `Start`.
-      memory: of the policy.
-      done: `[]` bool.
-      total: `[]` reward so far.
-      first: `[]` reward of the first action.
-    """
+    """An episode under way; `[N + 1]` looks and choices of NOP."""
 
     state: MapState
     looks: jax.Array
@@ -283,12 +207,6 @@ def every_state(
     """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
     If there are more than `limit`, it takes a fixed stratified sample.
-
-    Args:
-      num_pois: N.
-      num_classes: C.
-      num_modalities: M.
-      limit: maximum number of states.
 
     Returns:
       `[S, N]` int32 classes and `[S, N, M]` bool looks.
@@ -312,3 +230,86 @@ def every_state(
 def are_different(classes: Int[np.ndarray, "S N"]) -> Bool[np.ndarray, " S"]:
     """`[S]` bool, whether all of `[S, N]` classes differ, as in the paper's `N! 2^(N M)` states."""
     return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)
+
+
+Reference = Callable[[Known, jax.Array], jax.Array]
+"""`(known, classes [N]) -> [N + 1]` values; the true classes are hidden from all other policies."""
+
+
+def reference(
+    key: Key, mdp: MapMdp, modality: Index, models: Trained, labels: Int[Array, "M C"]
+) -> Reference:
+    """The optimal policy of an MDP, which learned policies are measured against.
+
+    Where beliefs accumulate looks, it is the policy `optimal` of missions, by dynamic programming
+    on the exact posterior. Where a look replaces the one before, a second look by the same sensor
+    never pays; then it takes every look whose simulated reward pays on average, given what the
+    earlier looks can reveal.
+
+    Args:
+      key: of the simulated rewards.
+      models: whose fusion is the MDP's.
+      labels: the label of each class in each modality.
+    """
+    if mdp.fusion.accumulates:
+        return lambda known, classes: policies.optimal(key, models, known)
+    rewards = expected_rewards(key, mdp, modality)
+    return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
+
+
+def has_optimum(fusion: Fusion, values: LookValues, is_sound: bool) -> bool:
+    """Whether `reference` is the optimum, up to the error of a fine lattice.
+
+    Args:
+      is_sound: whether the map's class probabilities roughly match exact Bayes; if not, only
+        rewards that do not read them, on a map that does not accumulate, have an optimum.
+    """
+    if not is_sound and (fusion.accumulates or values.labels is not None):
+        return False
+    number = len(fusion.classes.mean) if values.labels is None else values.labels.shape[1]
+    return not fusion.accumulates or steps_of_lattice(number, len(values.q)) >= _FINE
+
+
+def expected_rewards(
+    key: Key, mdp: MapMdp, modality: Index, num_draws: int = _NUM_DRAWS
+) -> Float[Array, "codes C"]:
+    """Expected reward of a look, by class and earlier looks.
+
+    Returns:
+      `[2^M, C]` mean reward of looking at a PoI of class c after looks by the modalities m whose
+      bits m are set in the first index.
+    """
+
+    def reward(given: tuple[Key, jax.Array, jax.Array]) -> jax.Array:
+        key, code, poi_class = given
+        reset_key, look_key = jax.random.split(key)
+        bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
+        seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
+        classes = jnp.full(mdp.num_pois, poi_class)
+        state = map_mdp.reset(reset_key, mdp, classes, seen)
+        return map_mdp.step(look_key, mdp, state, jnp.int32(0), modality)[1].reward
+
+    # Along one axis: one `vmap` in another takes three times as long to compile.
+    shape = (2**mdp.num_modalities, mdp.num_classes, num_draws)
+    codes, classes, _ = jnp.unravel_index(jnp.arange(math.prod(shape)), shape)
+    looks = (jax.random.split(key, math.prod(shape)), codes, classes)
+    rewards = jax.lax.map(reward, looks, batch_size=_AT_ONCE)  # networks read all N PoIs
+    return rewards.reshape(shape).mean(axis=-1)
+
+
+def _informed(
+    rewards: jax.Array, labels: jax.Array, seen: jax.Array, classes: jax.Array
+) -> jax.Array:
+    """`[N + 1]` mean rewards of looks over the classes that the labels seen so far leave open.
+
+    It knows the true labels of earlier looks, not their noise. Taking every look that pays is
+    optimal, because PoIs are independent and the order is free.
+    """
+
+    def of_poi(seen: jax.Array, poi_class: jax.Array) -> jax.Array:
+        is_same = labels == labels[:, poi_class][:, None]
+        is_open = jnp.all(is_same | ~seen[:, None], axis=0)
+        code = jnp.sum(seen << jnp.arange(len(labels)))
+        return jnp.sum(rewards[code] * is_open) / jnp.sum(is_open)
+
+    return jnp.append(jax.vmap(of_poi)(seen, classes), 0.0)

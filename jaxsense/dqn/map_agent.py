@@ -1,24 +1,20 @@
-"""The agent of the map MDP.
-
-Another kind is a new class with the attributes and methods of `environments.Agent`, as `team_agent`
-has one.
-"""
+"""The agent of the map MDP, and the environment in which it learns."""
 
 import dataclasses
 from collections.abc import Callable
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Index, Key, pytree
-from jaxsense.dqn.environments import MapEnvironment
-from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.dqn.places import Places
-from jaxsense.dqn.team_mdp import Names, Team
+from jaxsense.core.types import Belief, Index, Key, Transition, pytree
+from jaxsense.dqn import map_mdp, team_mdp
+from jaxsense.dqn.map_mdp import MapMdp, MapState, Outcome
+from jaxsense.dqn.team_mdp import Places, Team
 
 
 @pytree
@@ -27,105 +23,54 @@ class MapAgent:
 
     Attributes:
       discount: `[]` discount factor of a step.
-      num_pois: N.
-      latent_size: D.
-      hidden: sizes of the hidden layers.
     """
 
     discount: jax.Array | float
     num_pois: int = struct.field(pytree_node=False)
     latent_size: int = struct.field(pytree_node=False)
     hidden: tuple[int, ...] = struct.field(pytree_node=False)
-
-    @property
-    def counts_time(self) -> bool:
-        """False: looks take no time in the map MDP."""
-        return False
-
-    @property
-    def tour_networks(self) -> tuple[()]:
-        """None: without travel time there is no order to learn."""
-        return ()
+    counts_time = False
+    tour_networks: ClassVar[tuple] = ()
 
     def learner(self, modality: str) -> str:
-        """The name of what learns for robots of a modality: the modality."""
+        """Name of what learns for robots of a modality: the modality."""
         return modality
 
     def plays(self, num_pois: int) -> bool:
         """Whether the Q-network is for this number of PoIs."""
         return num_pois == self.num_pois
 
-    def with_discount(self, *, step: float, second: float) -> "MapAgent":
-        """The agent with another discount factor of a step, see `Agent.with_discount`.
-
-        Args:
-          step: the factor.
-          second: not used.
-        """
-        del second
-        return dataclasses.replace(self, discount=step)
-
-    def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> MapMdp:
-        """The map MDP.
-
-        Args:
-          of_number: number of PoIs to the map MDP.
-          places: not used.
-          names: not used.
-        """
+    def mdp(
+        self, of_number: Callable[[int], MapMdp], places: Places, names: tuple[str, ...]
+    ) -> MapMdp:
+        """The map MDP of a number of PoIs."""
         del places, names
         return of_number(self.num_pois)
 
-    def environment(self, mdp: MapMdp, modality: Index) -> MapEnvironment:
-        """What the agent learns in.
-
-        Args:
-          mdp: from `mdp`.
-          modality: index of the agent's own sensor.
-        """
+    def environment(self, mdp: PyTree, modality: Index) -> PyTree:
+        """What the agent learns in, with its own sensor."""
         return MapEnvironment(self, mdp, modality, self.discount)
-
-    @property
-    def num_inputs(self) -> int:
-        """S, the size of what `observe` returns."""
-        return 2 * self.num_pois * self.latent_size
 
     def init(self, key: Key) -> Params:
         """Random parameters of the Q-network."""
-        return networks.init(key, self._network, self.num_inputs)
+        return networks.init(key, self._network, 2 * self.num_pois * self.latent_size)
 
-    def init_tours(self, key: Key) -> tuple[()]:
-        """None, see `tour_networks`."""
+    def init_tours(self, key: Key) -> tuple[Params, ...]:
+        """No parameters: without travel time there is no order to learn."""
         del key
         return ()
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
-        """The map, see `observation`.
-
-        Args:
-          belief: `[N, D]` the map.
-          team: not used.
-          robot: not used.
-        """
+        """The map, see `observation`."""
         del team, robot
         return observation(belief)
 
     def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """The network's output, see `Agent.q`.
-
-        Args:
-          params: of the Q-network.
-          observed: `[N * 2D]`, or `[N * 2D, B]`.
-        """
+        """Each action's reward and the discounted best value after it; NOP's last."""
         return networks.apply(self._network, params, observed)
 
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """The same as `q`: looks take no time.
-
-        Args:
-          params: of the Q-network.
-          observed: `[N * 2D]`, or `[N * 2D, B]`.
-        """
+        """The same as `q`: looks take no time."""
         return self.q(params, observed)
 
     def decide(
@@ -137,18 +82,10 @@ class MapAgent:
         team: Team,
         robot: Int[Array, ""],
     ) -> Float[Array, " A"]:
-        """Values of a robot's actions in a mission, see `Agent.decide`.
+        """Values of a robot's actions in a mission.
 
         A PoI that is not present is shown to the network as one of a known class, about which
         nothing is left to learn. As its class is unknown, the values are means over all classes.
-
-        Args:
-          params: of the Q-network.
-          tour_params: not used.
-          classes: `[C, D]` joint posterior of each class.
-          belief: `[N, D]` the map.
-          team: which PoIs are present.
-          robot: not used.
         """
         del tour_params
 
@@ -164,24 +101,12 @@ class MapAgent:
         return jnp.where(jnp.append(team.present, True), values, -jnp.inf)
 
     def worth(
-        self,
-        params: Params,
-        classes: Belief,
-        belief: Belief,
-        team: Team,
-        robot: Int[Array, ""],
+        self, params: Params, classes: Belief, belief: Belief, team: Team, robot: Int[Array, ""]
     ) -> Float[Array, " N"]:
-        """What a look at each PoI is worth, see `Agent.worth`.
+        """Value of a look at each PoI less NOP's, if no other PoI is left.
 
         In a map with other open PoIs, a look that gains nothing is still worth what can be done
         after it, so each PoI is shown alone.
-
-        Args:
-          params: of the Q-network.
-          classes: `[C, D]` joint posterior of each class.
-          belief: `[N, D]` the map.
-          team: which PoIs are present.
-          robot: not used.
         """
 
         def of_poi(poi: Int[Array, ""]) -> jax.Array:
@@ -197,13 +122,51 @@ class MapAgent:
         return MLP(self.hidden, self.num_pois + 1)
 
 
+@pytree
+class MapEnvironment:
+    """Environment for `train`: the map MDP of one agent.
+
+    Attributes:
+      modality: index of the agent's own sensor, see `map_mdp.step`.
+    """
+
+    agent: MapAgent
+    mdp: MapMdp
+    modality: Index
+    discount: jax.Array | float
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.num_pois + 1
+
+    def reset(self, key: Key) -> MapState:
+        """A random first state."""
+        return map_mdp.reset(key, self.mdp)
+
+    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
+        """All actions exist."""
+        del state
+        return jnp.ones(self.num_actions, bool)
+
+    def observe(self, state: MapState) -> Float[Array, " S"]:
+        """The map."""
+        team = team_mdp.alone(self.mdp.num_pois, self.modality)
+        return self.agent.observe(state.belief, team, jnp.int32(0))
+
+    def step(
+        self, key: Key, state: MapState, s_tm1: Float[Array, " S"], action: Int[Array, ""]
+    ) -> tuple[MapState, Transition, Outcome]:
+        """Takes an action, see `training.Environment`."""
+        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
+        discount = jnp.where(outcome.terminated, 0.0, self.discount)
+        transition = Transition(s_tm1, action, outcome.reward, discount, self.observe(after))
+        return after, transition, outcome
+
+
 @checks.typed
 def observation(belief: Belief) -> Float[Array, " S"]:
-    """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI.
-
-    Raises:
-      ValueError: if a standard deviation is not positive.
-    """
+    """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI."""
     checks.require_shape("belief.mean", belief.mean, (None, None))
     checks.require_shape("belief.std", belief.std, belief.mean.shape)
     checks.require_positive("belief.std", belief.std)

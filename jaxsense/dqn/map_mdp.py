@@ -6,6 +6,7 @@ is no operation (NOP) and ends the episode.
 """
 
 import dataclasses
+import functools
 from typing import Protocol
 
 import jax
@@ -20,11 +21,7 @@ from jaxsense.dqn.rewards import Reward
 
 
 class Looks(Protocol):
-    """Protocol of the source of an MDP's looks, for example `Bank` or `Live`; a frozen pytree.
-
-    Attributes:
-      num_modalities: M.
-    """
+    """Protocol of the source of an MDP's looks, for example `Bank` or `Live`; a frozen pytree."""
 
     @property
     def num_modalities(self) -> int:
@@ -32,24 +29,13 @@ class Looks(Protocol):
         ...
 
     def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
-        """A random scene with PoIs of the given classes.
-
-        Args:
-          key: random key.
-          classes: `[N]` int32.
-        """
+        """A random scene with PoIs of the given classes."""
         ...
 
     def observe(
         self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
     ) -> tuple[Float[Array, " L"], Scene]:
         """Looks at a PoI.
-
-        Args:
-          key: random key of the look.
-          scene: from `scene` or an earlier look.
-          poi: `[]` int32.
-          modality: index of the sensor; static.
 
         Returns:
           `[D_m]` features, and the scene after the look.
@@ -62,11 +48,7 @@ class MapMdp:
     """The map MDP of one agent.
 
     Attributes:
-      looks: how it looks at a scene.
-      fusion: how a look updates a belief.
-      reward: of a look.
       config: length and starts of episodes.
-      num_pois: N.
     """
 
     looks: Looks
@@ -96,6 +78,11 @@ class MapMdp:
         return self.looks.num_modalities
 
     @property
+    def num_features(self) -> int:
+        """Numbers that an agent knows of each PoI: mean and standard deviation of its belief."""
+        return 2 * self.fusion.prior.mean.size
+
+    @property
     def num_classes(self) -> int:
         """C, the number of classes that a PoI can have."""
         return len(self.fusion.classes.mean)
@@ -110,7 +97,6 @@ class MapState:
     """State of the map MDP: the map, and the scene that it describes.
 
     Attributes:
-      belief: `[N, D]` the map.
       seen: `[N, M]` bool, which modalities have looked at which PoI; hidden from the policies.
       classes: `[N]` int32 true classes; hidden from the policies.
       scene: what the looks see; hidden from the policies.
@@ -139,7 +125,6 @@ class Outcome:
     """Outcome of an action: reward, duration, and whether the episode has ended.
 
     Attributes:
-      reward: `[]` float32.
       terminated: `[]` bool, NOP has ended the episode.
       truncated: `[]` bool, the episode has reached its limit of steps.
       seconds: `[]` that the action took; None in the map MDP, whose actions take no time.
@@ -154,17 +139,18 @@ class Outcome:
 def random_start(key: Key, mdp: MapMdp) -> tuple[Int[Array, " N"], Bool[Array, "N M"]]:
     """Random classes and earlier looks.
 
-    Args:
-      key: random key.
-      mdp: the MDP.
-
     Returns:
       Independent `[N]` int32 classes, and `[N, M]` bool, which modality has looked at which PoI.
     """
     class_key, seen_key = jax.random.split(key)
     classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
-    shape = (mdp.num_pois, mdp.num_modalities)
-    return classes, _random_seen(seen_key, shape, mdp.config.partly_seen_starts)
+    shape = mdp.num_pois, mdp.num_modalities
+    if not mdp.config.partly_seen_starts:
+        return classes, jax.random.bernoulli(seen_key, 0.5, shape)
+    # Neither all zero nor all one.
+    num_bits = mdp.num_pois * mdp.num_modalities
+    code = jax.random.randint(seen_key, (), 1, 2**num_bits - 1)
+    return classes, (code >> jnp.arange(num_bits) & 1).astype(bool).reshape(shape)
 
 
 def reset(
@@ -176,9 +162,6 @@ def reset(
     """Starts an episode in which some modalities have looked at some of the PoIs.
 
     Args:
-      key: random key.
-      mdp: the MDP.
-      classes: `[N]` int32 true classes; independent for each PoI by default.
       seen: `[N, M]` bool, which modality has looked at which PoI; random by default.
 
     Returns:
@@ -200,18 +183,9 @@ def reset_with_looks(
 ) -> tuple[MapState, tuple[jax.Array, ...]]:
     """Starts an episode as `reset` does, and also returns the features of its looks.
 
-    Args:
-      key: random key.
-      mdp: the MDP.
-      classes: see `reset`.
-      seen: see `reset`.
-
     Returns:
       The state, and for each modality `[N, D_m]` features of a look at each PoI; those that `seen`
       marks have updated the map.
-
-    Raises:
-      ValueError: if a class does not exist.
     """
     start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
     if classes is None or seen is None:
@@ -240,24 +214,14 @@ def begin(
     """Starts an episode in a given scene, see `reset`.
 
     Args:
-      key: random key.
-      mdp: the MDP.
-      scene: what the looks see.
-      classes: `[N]` int32 true classes.
-      seen: `[N, M]` bool, which modality has looked at which PoI.
       looks: for each modality `[N, D_m]` features of a look at each PoI; ignored where `seen` is
         False.
-
-    Raises:
-      ValueError: if `seen` is not bool.
     """
     checks.require_shape("seen", seen, (mdp.num_pois, mdp.num_modalities))
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
-    beliefs = jax.vmap(lambda looks, seen, first: _looked_at(mdp, looks, seen, first))(
-        looks, seen, first
-    )
+    beliefs = jax.vmap(functools.partial(_looked_at, mdp))(looks, seen, first)
     return MapState(beliefs, seen, classes, scene, jnp.int32(0))
 
 
@@ -265,14 +229,6 @@ def step(
     key: Key, mdp: MapMdp, state: MapState, action: Int[Array, ""], modality: Index
 ) -> tuple[MapState, Outcome]:
     """Looks at a PoI with one modality's sensor, or ends the episode.
-
-    Args:
-      key: random key.
-      mdp: the MDP.
-      state: the current state.
-      action: `[]` int32, a PoI or N for NOP.
-      modality: index of the agent's own sensor. As a `[]` int32 array one program serves all
-        modalities, and its range is not checked.
 
     Returns:
       The next state and the outcome. The reward is that of the look, see `Reward`; 0 for NOP; NaN
@@ -282,7 +238,10 @@ def step(
       ValueError: if there is no such modality or action, or if the reward is not one number.
     """
     checks.require_key(key)
-    _check_step(mdp, state, action, modality)
+    checks.require_type("state", state, MapState, "as from reset")
+    checks.require_index("modality", modality, mdp.num_modalities)
+    checks.require_shape("action", action, ())
+    checks.require_index("action", action, mdp.num_pois + 1)
     is_nop = action == mdp.num_pois
     poi = jnp.minimum(action, mdp.num_pois - 1)
     old = jax.tree.map(lambda x: x[poi], state.belief)
@@ -310,26 +269,6 @@ def step(
         truncated=~is_nop & (after.steps >= mdp.config.max_steps),
     )
     return after, outcome
-
-
-def _check_step(mdp: MapMdp, state: MapState, action: jax.Array, modality: Index) -> None:
-    """Checks the arguments of `step` against the MDP."""
-    checks.require_type("state", state, MapState, "as from reset")
-    checks.require_index("modality", modality, mdp.num_modalities)
-    checks.require_shape("action", action, ())
-    checks.require_index("action", action, mdp.num_pois + 1)
-    shape = (mdp.num_pois, *mdp.fusion.prior.mean.shape)
-    for part in (state.belief.mean, state.belief.std):
-        checks.require_shape("state.belief", part, shape)
-
-
-def _random_seen(key: Key, shape: tuple[int, int], is_partial: bool) -> jax.Array:
-    """Random bits; with `is_partial`, neither all zero nor all one."""
-    if not is_partial:
-        return jax.random.bernoulli(key, 0.5, shape)
-    num_bits = shape[0] * shape[1]
-    code = jax.random.randint(key, (), 1, 2**num_bits - 1)
-    return (code >> jnp.arange(num_bits) & 1).astype(bool).reshape(shape)
 
 
 def _looked_at(mdp: MapMdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:

@@ -53,23 +53,13 @@ class LookValues:
     def of_next(
         self, probabilities: Float[Array, " C"], is_seen: Bool[Array, ""]
     ) -> Float[Array, ""]:
-        """Value of the next look alone.
-
-        Args:
-          probabilities: `[C]` of the PoI's classes.
-          is_seen: `[]` bool, whether anybody has looked at the PoI.
-        """
+        """Value of the next look alone."""
         return jnp.where(is_seen, self._read(self.one_step, probabilities), self.one_step_unseen)
 
     def of_all(
         self, probabilities: Float[Array, " C"], is_seen: Bool[Array, ""]
     ) -> Float[Array, ""]:
-        """Value of the next look and all worthwhile looks after it.
-
-        Args:
-          probabilities: `[C]` of the PoI's classes.
-          is_seen: `[]` bool, whether anybody has looked at the PoI.
-        """
+        """Value of the next look and all worthwhile looks after it."""
         checks.require_probabilities("probabilities", probabilities)
         return jnp.where(is_seen, self._read(self.q, probabilities), self.q_unseen)
 
@@ -80,17 +70,7 @@ class LookValues:
 
 
 def steps_of_lattice(num_classes: int, max_points: int = MAX_POINTS) -> int:
-    """Steps of the lattice along each edge of the simplex; the more classes, the fewer.
-
-    Args:
-      num_classes: C.
-      max_points: of the lattice.
-
-    Raises:
-      ValueError: if a number is not a positive integer.
-    """
-    checks.require_number("num_classes", num_classes)
-    checks.require_number("max_points", max_points)
+    """Steps of the lattice along each edge of the simplex; the more classes, the fewer."""
     fits = [n for n in range(1, _MAX_STEPS + 1) if _num_points(n, num_classes) <= max_points]
     return max(fits, default=1)
 
@@ -100,15 +80,7 @@ def _num_points(steps: int, num_classes: int) -> int:
 
 
 def lattice(num_classes: int, max_points: int = MAX_POINTS) -> Float[np.ndarray, "P C"]:
-    """Class probabilities at the points of the lattice, in the order of a table's rows.
-
-    Args:
-      num_classes: C.
-      max_points: of the lattice.
-
-    Returns:
-      `[P, C]`.
-    """
+    """Class probabilities at the points of the lattice, in the order of a table's rows."""
     steps = steps_of_lattice(num_classes, max_points)
     each = itertools.combinations(range(steps + num_classes - 1), num_classes - 1)
     # C - 1 bars divide the steps among the classes.
@@ -122,12 +94,7 @@ def lattice(num_classes: int, max_points: int = MAX_POINTS) -> Float[np.ndarray,
 
 
 def _rows(sums, steps: int):
-    """Row of each point: its number in the combinatorial number system.
-
-    Args:
-      sums: `[..., C - 1]` steps of all classes but the first, of all but the first two, and so on.
-      steps: of the lattice.
-    """
+    """Row of each point: its number in the combinatorial number system."""
     size = sums.shape[-1]
     # Clip unused binomials that would overflow int32.
     table = [
@@ -140,18 +107,7 @@ def _rows(sums, steps: int):
 
 
 def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-    """Interpolates a table of values linearly between the points of the lattice.
-
-    Args:
-      table: `[P]` values at the points of `lattice`.
-      probabilities: `[C]` of the classes.
-
-    Returns:
-      `[]` the value.
-
-    Raises:
-      ValueError: if no lattice of these classes has P points.
-    """
+    """Interpolates a table of values linearly between the points of the lattice."""
     checks.require_shape("probabilities", probabilities, (None,))
     checks.require_shape("table", table, (None,))
     steps = steps_of_lattice(len(probabilities), len(table))
@@ -200,27 +156,17 @@ def value_iteration(
     Args:
       likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
         each of K equally likely looks at a PoI of each class.
-      reward: of a look.
-      mixture: `[C]` class probabilities to the `[D]` belief that holds them.
-      prior: `[D]` belief of an unseen PoI.
-      config: `max_steps`, which also limits the looks at one PoI.
-      horizon: maximum number of looks at one PoI; static.
-      max_points: of the lattice; static.
       start: `[C]` probabilities of an unseen PoI's classes; by default, they are equally likely.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `q` is
       above 0, that of no operation.
-
-    Raises:
-      ValueError: if a likelihood is not finite, `horizon` is not positive, `start` does not hold
-        probabilities, or `reward` or `config` is something else.
     """
     checks.require_members("reward", reward, Reward, ("information", "of_gain"))
     checks.require_type("config", config, MdpConfig, "as config.mdp")
     checks.require_shape("likelihoods", likelihoods, (None, None, None))
     number, num_looks, _ = likelihoods.shape
-    checks.require_shape("likelihoods", likelihoods, (number, num_looks, number))
+    checks.require_shape("likelihoods", likelihoods, (number, None, number))
     checks.require_finite("likelihoods", likelihoods)
     checks.require_number("horizon", horizon)
     points = jnp.asarray(lattice(number, max_points), likelihoods.dtype)
@@ -235,7 +181,6 @@ def value_iteration(
         return reward.information(mixture(probabilities), probabilities)
 
     before = jax.vmap(information)(points)
-    checks.require_shape("reward.information of all points", before, (len(points),))
     before = before.at[-1].set(reward.information(prior, points[-1]))
 
     def looks(row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:

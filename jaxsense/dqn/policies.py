@@ -5,7 +5,6 @@ which is taken; the last is NOP's. A custom policy is one more entry of a table.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -16,10 +15,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import ConfigError
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn import rules
-from jaxsense.dqn.environments import Agent
+from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.dqn.team_agent import TeamAgent
 from jaxsense.dqn.team_mdp import Team
+
+Agent = MapAgent | TeamAgent
+"""How a Q-network is used; its parameters are kept apart."""
+
+_TAKEN = 1e2  # s, detour that a robot prefers to a PoI where another is heading
 
 
 @pytree
@@ -27,12 +31,10 @@ class Known:
     """Input of a policy: what a robot knows when it chooses.
 
     Attributes:
-      belief: `[N, D]` the map.
       looks: `[N, M]` int32, looks of each modality at each PoI.
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes.
       team: robots and PoIs at this moment; PoIs that the robot has given up are not present.
       times: `[R, N]` seconds until each robot has looked at each PoI, by the travel model.
-      robot: `[]` int32, the robot that chooses.
     """
 
     belief: Belief
@@ -91,7 +93,6 @@ class Policy:
     """A policy: a function that values looks, and how missions use the values.
 
     Attributes:
-      values: see `Values`.
       counts_time: `agent -> bool`, whether the values include travel time, so that no other rule
         needs to order looks.
       is_unordered: whether looks that pay may be taken in any order, so that missions choose one,
@@ -106,13 +107,7 @@ class Policy:
     worth: Values | None = None
 
     def gains(self, key: Key, models: "Trained", known: Known) -> Float[Array, " N"]:
-        """Numbers above 0 for the looks that pay, see `worth`.
-
-        Args:
-          key: random key.
-          models: trained models.
-          known: what the robot knows.
-        """
+        """Numbers above 0 for the looks that pay, see `worth`."""
         if self.worth is not None:
             return self.worth(key, models, known)
         values = self.values(key, models, known)
@@ -125,11 +120,7 @@ def as_policy(policy: Values | Policy) -> Policy:
 
 
 def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
-    """All policies by name: `POLICIES`, then your own.
-
-    Raises:
-      ConfigError: if a custom policy has the name of one of `POLICIES`.
-    """
+    """All policies by name: `POLICIES`, then your own."""
     wrapped = {name: as_policy(each) for name, each in (own or {}).items()}
     for name, each in wrapped.items():
         if POLICIES.get(name, each) is not each:
@@ -142,27 +133,6 @@ def best(values: Float[Array, " A"]) -> Int[Array, ""]:
     return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values)).astype(jnp.int32)
 
 
-def expected_gains(
-    fusion: Fusion,
-    look_values: tuple[LookValues, ...],
-    belief: Belief,
-    is_seen: Bool[Array, " N"],
-) -> Float[Array, "M N"]:
-    """Expected reward of each modality's next look at each PoI, given the map.
-
-    Args:
-      fusion: reads the map.
-      look_values: of each modality.
-      belief: `[N, D]` the map.
-      is_seen: `[N]` bool.
-
-    Returns:
-      `[M, N]`.
-    """
-    of_poi = jax.vmap(functools.partial(expected_gain, fusion, look_values), out_axes=1)
-    return of_poi(belief, is_seen)
-
-
 def expected_gain(
     fusion: Fusion,
     look_values: tuple[LookValues, ...],
@@ -172,26 +142,14 @@ def expected_gain(
     """Expected reward of each modality's next look at one PoI, given the map.
 
     Args:
-      fusion: reads the map.
-      look_values: of each modality.
-      belief: `[D]` of the PoI.
-      is_seen: `[]` bool.
-
-    Returns:
-      `[M]`.
+      is_seen: whether anybody has looked at the PoI.
     """
     on_map = fusion.class_probabilities(belief)
     return jnp.stack([values.of_next(on_map, is_seen) for values in look_values])
 
 
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Asks the trained Q-network.
-
-    Args:
-      key: not used.
-      models: trained models.
-      known: what the robot knows.
-    """
+    """Asks the trained Q-network."""
     del key
     return models.agent.decide(
         _own_network(models, known),
@@ -204,56 +162,35 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
 
 
 def latent_worth(key: Key, models: Trained, known: Known) -> Float[Array, " N"]:
-    """Asks the trained Q-network which looks pay.
-
-    Args:
-      key: not used.
-      models: trained models.
-      known: what the robot knows.
-    """
+    """Asks the trained Q-network which looks pay."""
     del key
     q_network, classes = _own_network(models, known), models.fusion.classes
     return models.agent.worth(q_network, classes, known.belief, known.team, known.robot)
 
 
 def greedy(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes the look with the highest expected gain on the map.
-
-    Args:
-      key: not used.
-      models: trained models.
-      known: what the robot knows.
-    """
+    """Takes the look with the highest expected gain on the map."""
     del key
     return jnp.append(_gains(models, known)[known.robot], 0.0)
 
 
-def bayes(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes the look with the highest expected gain on the exact posterior over the classes.
+def _by_exact_bayes(read: Callable[..., jax.Array]) -> Values:
+    """Reads the values of looks at the exact posterior over the classes."""
 
-    Args:
-      key: not used.
-      models: trained models.
-      known: what the robot knows.
-    """
-    del key
-    exact = jnp.exp(known.log_posterior)
-    gains = [jax.vmap(x.of_next)(exact, known.is_seen) for x in models.look_values]
-    return jnp.append(jnp.stack(gains)[known.modality], 0.0)
+    def values(key: Key, models: Trained, known: Known) -> jax.Array:
+        del key
+        exact = jnp.exp(known.log_posterior)
+        found = [jax.vmap(read, (None, 0, 0))(x, exact, known.is_seen) for x in models.look_values]
+        return jnp.append(jnp.stack(found)[known.modality], 0.0)
+
+    return values
 
 
-def optimal(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes the look with the highest total gain by dynamic programming on the exact posterior.
+bayes = _by_exact_bayes(LookValues.of_next)
+"""Takes the look with the highest expected gain on the exact posterior over the classes."""
 
-    Args:
-      key: not used.
-      models: trained models.
-      known: what the robot knows.
-    """
-    del key
-    exact = jnp.exp(known.log_posterior)
-    values = [jax.vmap(x.of_all)(exact, known.is_seen) for x in models.look_values]
-    return jnp.append(jnp.stack(values)[known.modality], 0.0)
+optimal = _by_exact_bayes(LookValues.of_all)
+"""Takes the look with the highest total gain by dynamic programming on the exact posterior."""
 
 
 def naive(number: int) -> Values:
@@ -268,32 +205,85 @@ def naive(number: int) -> Values:
 
 
 def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes every action with equal chance; one that does not exist is no operation in missions.
-
-    Args:
-      key: random key.
-      models: not used.
-      known: what the robot knows.
-    """
+    """Takes every action with equal chance; one that does not exist is no operation in missions."""
     del models
     number = len(known.looks) + 1
     return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
 
 
-def _by_rule(rule: rules.Rule) -> Values:
-    """A hand-written rule on expected gains and the team's travel times."""
+def nearest(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
+    """Rule that prefers the nearest PoI with a positive expected gain.
+
+    Args:
+      gains: expected reward of each robot's look.
+      times: seconds until each robot has looked.
+      team: robots and PoIs at this moment; PoIs that other robots head for come last.
+      agent: the robot that chooses.
+    """
+    return _with_nop(1 / (1 + _cost(times, team, agent)), _is_useful(gains, team)[agent])
+
+
+def auction(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
+    """Rule that ranks the PoI won in a sequential auction first, the rest as `nearest` does.
+
+    Each robot at work bids its travel time for each PoI with a positive expected gain. The lowest
+    bid wins its PoI, robot and PoI leave, and so on (Koenig et al. 2006, sequential single-item
+    auctions, with one item each).
+    """
+    bids = jnp.where(_is_useful(gains, team) & team.works[:, None], times, jnp.inf)
+
+    def sell(_, carry):
+        bids, won = carry
+        robot, poi = jnp.unravel_index(jnp.argmin(bids), bids.shape)
+        is_sold = jnp.isfinite(bids[robot, poi])
+        won = won.at[robot].set(jnp.where(is_sold, poi, won[robot]))
+        left = bids.at[robot].set(jnp.inf).at[:, poi].set(jnp.inf)
+        return jnp.where(is_sold, left, bids), won
+
+    num_robots, num_pois = bids.shape
+    nothing = jnp.full(num_robots, num_pois)
+    won = jax.lax.fori_loop(0, num_robots, sell, (bids, nothing))[1][agent]
+    # All other values are at most 1.
+    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, 1.0, 0.0))
+
+
+def gain_rate(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
+    """Rule that prefers the PoI with the highest expected gain for each second."""
+    return _with_nop(gains[agent] / _cost(times, team, agent), _is_useful(gains, team)[agent])
+
+
+def _is_useful(gains: jax.Array, team: Team) -> jax.Array:
+    return (gains > 0) & team.present[None]
+
+
+def _cost(times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
+    return times[agent] + jnp.where(team.is_taken(agent), _TAKEN, 0.0)
+
+
+def _with_nop(values: jax.Array, is_useful: jax.Array) -> jax.Array:
+    return jnp.append(jnp.where(is_useful, values, -1.0), 0.0)
+
+
+def _by_rule(rule: Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]) -> Policy:
+    """A hand-written rule on expected gains and the team's travel times, see `nearest`."""
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         del key
-        gains = _gains(models, known)
-        return rule(gains, known.times, known.team, known.robot)
+        return rule(_gains(models, known), known.times, known.team, known.robot)
 
-    return values
+    return Policy(values, lambda agent: True)
 
 
 def _gains(models: Trained, known: Known) -> jax.Array:
     """`[R, N]` expected gains of each robot's next look at each PoI, on the map."""
-    of_modality = expected_gains(models.fusion, models.look_values, known.belief, known.is_seen)
+    gain = lambda belief, seen: expected_gain(models.fusion, models.look_values, belief, seen)  # noqa: E731
+    of_modality = jax.vmap(gain, out_axes=1)(known.belief, known.is_seen)
     return of_modality[known.team.modality]
 
 
@@ -302,15 +292,9 @@ def _own_network(models: Trained, known: Known) -> Params:
     return jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
 
 
-def _always(agent: Agent) -> bool:
-    """Says that a policy's highest value is its choice, which no rule of missions changes."""
-    del agent
-    return True
-
-
 POLICIES: dict[str, Policy] = {
     "latent": Policy(latent, lambda agent: agent.counts_time, True, latent_worth),
-    "network": Policy(latent, _always),
+    "network": Policy(latent, lambda agent: True),
     "greedy": Policy(greedy, is_unordered=True),
     "bayes": Policy(bayes, is_unordered=True),
     "optimal": Policy(optimal, is_unordered=True),
@@ -318,8 +302,8 @@ POLICIES: dict[str, Policy] = {
     "naive_2": Policy(naive(2), is_unordered=True),
     "naive_3": Policy(naive(3), is_unordered=True),
     "random": Policy(random),
-    "nearest": Policy(_by_rule(rules.nearest), _always),
-    "auction": Policy(_by_rule(rules.auction), _always),
-    "rollout": Policy(_by_rule(rules.gain_rate), _always),
+    "nearest": _by_rule(nearest),
+    "auction": _by_rule(auction),
+    "rollout": _by_rule(gain_rate),
 }
 """Built-in policies, by name."""

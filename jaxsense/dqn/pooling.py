@@ -22,7 +22,6 @@ class PoolingNetwork(nn.Module):
     """The network of a team, for its Q-values and its tours.
 
     Attributes:
-      hidden: sizes of the hidden layers, the same for each PoI.
       features: numbers known of each PoI; the last three are its presence and its position.
     """
 
@@ -36,7 +35,6 @@ class PoolingNetwork(nn.Module):
         """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`.
 
         Args:
-          x: what is known of each PoI.
           others: what each PoI's value takes the other PoIs to be; as in `x` by default. Presence
             and positions are those of `x`.
         """
@@ -96,17 +94,7 @@ def _max_of_others(x: jax.Array) -> jax.Array:
 
 
 def _heard(own: jax.Array, others: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
-    """Sums the messages of all PoIs, weighted by travel time.
-
-    Args:
-      own: `[M, N, ...]` what each PoI tells itself.
-      others: `[M, N, ...]` what each PoI tells the others.
-      present: `[1, N, ...]` whether it exists.
-      place: see `_seconds_between`.
-
-    Returns:
-      `[2M, N, ...]`.
-    """
+    """Sums the messages of all PoIs, weighted by travel time."""
     seconds = _seconds_between(place)
     near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
 

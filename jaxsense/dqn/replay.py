@@ -31,9 +31,6 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
     Args:
       state_size: numbers in a state.
       rounds: capacity, T.
-      blocks: of environments, G.
-      width: environments in a block, W. Transitions of one round are independent, so a batch of a
-        few dozen blocks is as good as one of single transitions.
     """
     for name, value in (("rounds", rounds), ("blocks", blocks), ("width", width)):
         checks.require_number(name, value)
@@ -45,14 +42,13 @@ def add(replay: Replay, transitions: Transition) -> Replay:
     """Adds a round, which replaces the oldest once the memory is full.
 
     Args:
-      replay: the memory.
       transitions: `[S, E]` states, `[E]` other fields; stored as float32.
     """
     rounds, blocks, rows, width = replay.columns.shape
-    checks.require_shape("transitions.s_tm1", transitions.s_tm1, ((rows - 3) // 2, blocks * width))
-    checks.require_shape("transitions.s_t", transitions.s_t, transitions.s_tm1.shape)
-    for name in ("a_tm1", "r_t", "discount_t"):
-        checks.require_shape(f"transitions.{name}", getattr(transitions, name), (blocks * width,))
+    state, number = ((rows - 3) // 2, blocks * width), (blocks * width,)
+    shapes = {"s_tm1": state, "a_tm1": number, "r_t": number, "discount_t": number, "s_t": state}
+    for name, shape in shapes.items():
+        checks.require_shape(f"transitions.{name}", getattr(transitions, name), shape)
     # Actions beyond 256 have no name in 16 bits.
     given = jax.tree.map(lambda x: x.astype(replay.columns.dtype), transitions)
     scalars = jnp.stack([given.a_tm1, given.r_t, given.discount_t])
@@ -71,13 +67,9 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
 
     Args:
       draws: `[B, 2]` uniform numbers in [0, 1), for the round and for the block.
-      replay: the memory.
 
     Returns:
       `[S, B * W]` states, and `[B * W]` other fields.
-
-    Raises:
-      ValueError: if the draws are not such numbers, or have 16 bits; or if the memory is empty.
     """
     checks.require_shape("draws", draws, (None, 2))
     if draws.dtype.itemsize < 4:

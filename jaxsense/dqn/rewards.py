@@ -21,12 +21,7 @@ class Reward(Protocol):
         ...
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-        """Information of a belief.
-
-        Args:
-          belief: `[D]`.
-          probabilities: `[C]` class probabilities that it holds.
-        """
+        """Information of a belief."""
         ...
 
     def of_gain(self, gain: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -43,19 +38,10 @@ class Paper:
     """
 
     min_increase: jax.Array | float
-
-    @property
-    def is_of_labels(self) -> bool:
-        """False: the width of a belief depends on all classes."""
-        return False
+    is_of_labels = False  # the width of a belief depends on all classes
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-        """Information of a belief, see the function `information`.
-
-        Args:
-          belief: `[D]`.
-          probabilities: not used.
-        """
+        """Information of a belief, see the function `information`."""
         del probabilities
         return information(belief.std)
 
@@ -73,19 +59,10 @@ class Nats:
     """
 
     look_cost: jax.Array | float
-
-    @property
-    def is_of_labels(self) -> bool:
-        """True, see `dqn.optimum`."""
-        return True
+    is_of_labels = True  # see `dqn.optimum`
 
     def information(self, belief: Belief, probabilities: Float[Array, " C"]) -> Float[Array, ""]:
-        """Negative entropy of the classes, in nats.
-
-        Args:
-          belief: not used.
-          probabilities: `[C]` class probabilities.
-        """
+        """Negative entropy of the classes, in nats."""
         del belief
         return -entropy(probabilities)
 
@@ -95,12 +72,7 @@ class Nats:
 
 
 def make(config: MdpConfig) -> Reward:
-    """Makes the reward that the settings name.
-
-    Raises:
-      ConfigError: if a function that they name cannot be imported.
-      ValueError: if it does not make a `Reward`.
-    """
+    """Makes the reward that the settings name."""
     known = {"paper": Paper(config.min_increase), "nats": Nats(config.look_cost)}
     if config.reward in known:
         return known[config.reward]
@@ -113,15 +85,6 @@ def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
     """Computes the information of a belief, `I = 1 / ||std||_2`.
 
     Korthals et al. 2018, Sec. IV.
-
-    Args:
-      std: `[..., D]` positive standard deviations.
-
-    Returns:
-      `[...]` information in inverse latent units; grows without bound as `std` -> 0.
-
-    Raises:
-      ValueError: if a standard deviation is not positive.
     """
     checks.require_shape("std", std, (..., None))
     checks.require_positive("std", std)

@@ -1,4 +1,4 @@
-"""The agent of a team: one network for any number of PoIs and robots."""
+"""The agent of a team, one network for any number of PoIs and robots, and its environment."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,19 +6,16 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.config import TeamConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.core.types import Belief, Index, Key, Transition, pytree
 from jaxsense.dqn import team_mdp, tours
-from jaxsense.dqn.environments import TeamEnvironment
-from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.dqn.places import Places
+from jaxsense.dqn.map_mdp import MapMdp, Outcome
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import Names, Team, TeamMdp
-from jaxsense.dqn.travel import Travel
+from jaxsense.dqn.team_mdp import Places, Team, TeamMdp, TeamState, Travel
 
 _NOT_WORTH_IT = -1e6  # s, below minus any tour
 
@@ -28,12 +25,8 @@ class TeamAgent:
     """An agent of the team MDP: one network for any number of PoIs and robots.
 
     Attributes:
-      config: the travel model and the price of time.
       discount: `[]` discount factor of a second.
       useless: `[]` reward of a look that tells nothing.
-      latent_size: D.
-      num_modalities: M.
-      hidden: sizes of the hidden layers.
       orders: whether a network orders looks, see `tours`.
     """
 
@@ -47,7 +40,7 @@ class TeamAgent:
 
     @property
     def counts_time(self) -> bool:
-        """Whether it orders looks: then no other rule needs to."""
+        """Whether values include travel time, so that no other rule needs to order looks."""
         return self.orders
 
     @property
@@ -62,7 +55,7 @@ class TeamAgent:
         return (self.network,) if self.orders else ()
 
     def learner(self, modality: str) -> str:
-        """The name of what learns for robots of a modality: all robots share one network."""
+        """Name of what learns for robots of a modality: all robots share one network."""
         del modality
         return "team"
 
@@ -71,34 +64,15 @@ class TeamAgent:
         del num_pois
         return True
 
-    def with_discount(self, *, step: float, second: float) -> "TeamAgent":
-        """The agent with another discount factor of a second, see `Agent.with_discount`.
+    def mdp(
+        self, of_number: Callable[[int], MapMdp], places: Places, names: tuple[str, ...]
+    ) -> TeamMdp:
+        """The team MDP, from the map MDP of a number of PoIs and the names of the sensors."""
+        number = self.config.num_pois[1]
+        return TeamMdp(self.config, of_number(number), places, names, self._travel)
 
-        Args:
-          step: not used.
-          second: the factor.
-        """
-        del step
-        return dataclasses.replace(self, discount=second)
-
-    def mdp(self, of_number: Callable[[int], MapMdp], places: Places, names: Names) -> TeamMdp:
-        """The team MDP.
-
-        Args:
-          of_number: number of PoIs to the map MDP.
-          places: draws positions of PoIs and robots.
-          names: of the sensors.
-        """
-        travel = Travel(self.config.travel.view_distance)
-        return TeamMdp(self.config, of_number(self.config.num_pois[1]), places, names, travel)
-
-    def environment(self, mdp: TeamMdp, modality: Index) -> TeamEnvironment:
-        """What the agent learns in.
-
-        Args:
-          mdp: from `mdp`.
-          modality: not used.
-        """
+    def environment(self, mdp: PyTree, modality: Index) -> PyTree:
+        """What the agent learns in, whatever its own sensor is."""
         del modality
         return TeamEnvironment(self, mdp)
 
@@ -111,15 +85,9 @@ class TeamAgent:
         return tuple(self.init(key) for _ in self.tour_networks)
 
     def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
-        """What a robot knows of each PoI, see `team_mdp.observation`.
-
-        Args:
-          belief: `[N, D]` the map.
-          team: robots and PoIs at this moment.
-          robot: `[]` int32, the robot that chooses.
-        """
-        travel, number = Travel(self.config.travel.view_distance), self.num_modalities
-        return team_mdp.observation(travel, belief, team, robot, number).reshape(-1)
+        """What a robot knows of each PoI, `[F * N]`, see `team_mdp.observation`."""
+        number = self.num_modalities
+        return team_mdp.observation(self._travel, belief, team, robot, number).reshape(-1)
 
     def q(
         self,
@@ -127,11 +95,11 @@ class TeamAgent:
         observed: Float[Array, "S ..."],
         others: Float[Array, "S ..."] | None = None,
     ) -> Float[Array, "A ..."]:
-        """Values once the robot has arrived, see `Agent.q`.
+        """Values once the robot has arrived; NOP's last.
 
         Args:
           params: of the Q-network.
-          observed: `[F * N]`, or `[F * N, B]`.
+          observed: what the robot knows.
           others: what each PoI's value takes the other PoIs to be; as observed by default.
         """
         inputs = (observed,) if others is None else (observed, others)
@@ -141,10 +109,6 @@ class TeamAgent:
         """Discounts values on arrival to the time of departure.
 
         `discount^t q - second_cost t`, with `t` the seconds until the look. NOP takes none.
-
-        Args:
-          params: of the Q-network.
-          observed: `[F * N]`, or `[F * N, B]`.
         """
         after = self.q(params, observed)
         of_pois = self.discount ** self._own_seconds(observed) * after[:-1]
@@ -162,19 +126,11 @@ class TeamAgent:
         """Values of a robot's actions that rank PoIs by predicted completion time.
 
         A look is worthwhile if its Q-value, were it the only one left, exceeds the price of the
-        travel time. If none is, those are that would be if no other robot were at work, see
-        `worth`: a robot that leaves a PoI to one that is nearer stays until that look was enough.
+        travel time. If no look is, judge as if the robot were alone, see `worth`: a robot that
+        leaves a PoI to one that is nearer stays until that look was enough.
         The value of a worthwhile look is minus the predicted seconds of `tours`; that of NOP is
         lower, and those of other looks are lowest. Without `tour_params`, the values are those of
         `values`, and lowest for looks that are worth nothing.
-
-        Args:
-          params: of the Q-network.
-          tour_params: of the network of `tours`, or none.
-          classes: `[C, D]` joint posterior of each class.
-          belief: `[N, D]` the map.
-          team: robots and PoIs at this moment.
-          robot: `[]` int32, the robot that chooses.
         """
         seen = self.observe(belief, team, robot)
         is_useless = self.worth(params, classes, belief, team, robot) <= 0
@@ -190,23 +146,11 @@ class TeamAgent:
         return jnp.append(jnp.where(jnp.isnan(after), after, of_pois), _NOT_WORTH_IT)
 
     def worth(
-        self,
-        params: Params,
-        classes: Belief,
-        belief: Belief,
-        team: Team,
-        robot: Int[Array, ""],
+        self, params: Params, classes: Belief, belief: Belief, team: Team, robot: Int[Array, ""]
     ) -> Float[Array, " N"]:
-        """What a look at each PoI is worth, see `Agent.worth`, were no other robot at work.
+        """Value of a look at each PoI less NOP's, were no other robot at work, nor PoI left.
 
         Who looks is for others to say: the network would leave a PoI to a robot that is nearer.
-
-        Args:
-          params: of the Q-network.
-          classes: `[C, D]` joint posterior of each class.
-          belief: `[N, D]` the map.
-          team: robots and PoIs at this moment.
-          robot: `[]` int32, the robot that chooses.
         """
         alone = team_mdp.alone(team.present.shape[0], team.modality[robot])
         alone = dataclasses.replace(alone, present=team.present)
@@ -218,12 +162,7 @@ class TeamAgent:
         return after - self.config.second_cost * self._own_seconds(observed)
 
     def _q_alone(
-        self,
-        params: Params,
-        classes: Belief,
-        belief: Belief,
-        team: Team,
-        robot: Int[Array, ""],
+        self, params: Params, classes: Belief, belief: Belief, team: Team, robot: Int[Array, ""]
     ) -> Float[Array, " N"]:
         """Q-value of a look at each PoI if nothing were left to learn about the others.
 
@@ -240,7 +179,80 @@ class TeamAgent:
         # Where there is no PoI both are far below any reward.
         return jnp.where(team.present, of_look - of_known + self.useless, of_look)
 
+    @property
+    def _travel(self) -> Travel:
+        return Travel(self.config.travel.view_distance)
+
     def _own_seconds(self, observed: jax.Array) -> jax.Array:
         """The robot's own time to look at each PoI, `[N, ...]`."""
         features = observed.reshape(self.network.features, -1, *observed.shape[1:])
         return team_mdp.own_seconds(features, self.latent_size)
+
+
+@pytree
+class SmdpState:
+    """State of a team, with each robot's observation and choice when it last set out."""
+
+    now: TeamState
+    observation: jax.Array
+    action: jax.Array
+
+
+@pytree
+class TeamEnvironment:
+    """Environment for `train`: the team MDP, whose robots share one agent.
+
+    Attributes:
+      robots: `[R]` int32 index of each robot's sensor; None for a random team in each episode.
+    """
+
+    agent: PyTree
+    mdp: TeamMdp
+    robots: jax.Array | None = None
+
+    @property
+    def num_actions(self) -> int:
+        """A look at each PoI, and NOP."""
+        return self.mdp.map.num_pois + 1
+
+    def reset(self, key: Key) -> SmdpState:
+        """A random first state, in which no robot has set out."""
+        now = team_mdp.reset(key, self.mdp, self.robots)
+        observed = self.agent.observe(now.map.belief, now.team, now.agent)
+        num_robots, num_pois = len(now.team.works), self.mdp.map.num_pois
+        nothing = jnp.zeros((num_robots, len(observed)))
+        return SmdpState(now, nothing, jnp.full(num_robots, num_pois))
+
+    def action_mask(self, state: SmdpState) -> Bool[Array, " A"]:
+        """Mask `[A]` of the PoIs that are present, and NOP."""
+        return team_mdp.action_mask(state.now)
+
+    def observe(self, state: SmdpState) -> Float[Array, " S"]:
+        """Observation `[F * N]` of the robot that chooses."""
+        now = state.now
+        return self.agent.observe(now.map.belief, now.team, now.agent)
+
+    def step(
+        self, key: Key, state: SmdpState, s_tm1: Float[Array, " S"], action: Int[Array, ""]
+    ) -> tuple[SmdpState, Transition, Outcome]:
+        """Lets one robot choose, see `Environment.step`.
+
+        Returns:
+          The next state; the transition of the robot that has just looked, from when it set out;
+          and the outcome.
+        """
+        seen = state.observation.at[state.now.agent].set(s_tm1)
+        chosen = state.action.at[state.now.agent].set(action)
+        now, outcome = team_mdp.step(key, self.mdp, state.now, action)
+        after = SmdpState(now, seen, chosen)
+        # A transition is complete when a robot has looked. Otherwise emit an invalid action, whose
+        # value and target are 0.
+        looked = chosen[now.agent] < self.mdp.map.num_pois
+        transition = Transition(
+            s_tm1=seen[now.agent],
+            a_tm1=jnp.where(looked, chosen[now.agent], -1),
+            r_t=outcome.reward,
+            discount_t=jnp.where(looked, 1.0, 0.0),
+            s_t=self.observe(after),
+        )
+        return after, transition, outcome

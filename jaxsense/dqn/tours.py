@@ -21,10 +21,9 @@ from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import team_mdp
-from jaxsense.dqn.losses import pseudo_huber
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState
-from jaxsense.dqn.travel import travel_seconds
+from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState, travel_seconds
+from jaxsense.dqn.training import pseudo_huber
 
 
 class Policy(Protocol):
@@ -34,21 +33,11 @@ class Policy(Protocol):
     """
 
     def read(self, belief: Belief, is_seen: Bool[Array, ""]) -> Float[Array, " G"]:
-        """`[G]` what the policy reads of one PoI.
-
-        Args:
-          belief: `[D]` of the PoI.
-          is_seen: `[]` whether anybody has looked at it.
-        """
+        """`[G]` what the policy reads of one PoI."""
         ...
 
     def values(self, read: Float[Array, "N G"], state: TeamState) -> Float[Array, " A"]:
-        """Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest.
-
-        Args:
-          read: `[N, G]` of all PoIs.
-          state: the current state.
-        """
+        """Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest."""
         ...
 
 
@@ -85,17 +74,7 @@ class Trials:
 
 
 def try_choices(key: Key, mdp: TeamMdp, policy: Policy, number: int) -> Trials:
-    """Tries choices in random states.
-
-    Args:
-      key: random key.
-      mdp: the MDP.
-      policy: of all robots, before and after the choice.
-      number: B, of states.
-
-    Returns:
-      `[..., B]` trials.
-    """
+    """Tries choices in random states."""
     # Alone, all PoIs share a position, so there is no order to learn.
     mdp = dataclasses.replace(mdp, alone=0.0)
     keys = jax.random.split(key, number)
@@ -184,13 +163,7 @@ def _step(
 
 
 def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
-    """An empty buffer of trials.
-
-    Args:
-      num_features: F, see `team_mdp.num_features`.
-      num_pois: N.
-      number: of states.
-    """
+    """An empty buffer of trials."""
     return Trials(
         observation=jnp.zeros((num_features * num_pois, number)),
         is_tried=jnp.zeros((num_pois, number), bool),
@@ -199,13 +172,7 @@ def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
 
 
 def write(trials: Trials, found: Trials, column: Int[Array, ""]) -> Trials:
-    """Writes trials into a buffer.
-
-    Args:
-      trials: the buffer.
-      found: the trials of some states.
-      column: `[]` int32, the first to write.
-    """
+    """Writes trials into a buffer."""
     return jax.tree.map(
         lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, column, axis=1),
         trials,
@@ -218,12 +185,6 @@ def seconds(
 ) -> Float[Array, "N ..."]:
     """Mean seconds until robots are done if this one sets out for each PoI, up to a constant.
 
-    Args:
-      network: of a team.
-      params: its parameters.
-      observation: `[F * N, ...]` what the robot knows.
-      latent_size: D.
-
     Returns:
       `[N, ...]`; only differences between PoIs that are present have a meaning.
     """
@@ -234,14 +195,7 @@ def seconds(
 
 @pytree
 class Fitting:
-    """The fit of a network to the differences between choices tried from the same state.
-
-    Attributes:
-      config: steps and learning rate.
-      trials: all so far.
-      network: of a team.
-      latent_size: D.
-    """
+    """The fit of a network to the differences between choices tried from the same state."""
 
     config: ToursConfig
     trials: Trials
@@ -249,15 +203,7 @@ class Fitting:
     latent_size: int = struct.field(pytree_node=False)
 
     def draw(self, key: Key, number: int) -> Int[Array, "T B"]:
-        """Draws states in which choices were tried, see `supervised.Problem.draw`.
-
-        Args:
-          key: random key.
-          number: of steps.
-
-        Returns:
-          `[number, B]` int32 columns of the trials.
-        """
+        """Draws states in which choices were tried, see `supervised.Problem.draw`."""
         counts = jnp.any(self.trials.is_tried, axis=0)
         first = jnp.argsort(~counts)
         drawn = jax.random.uniform(key, (number, min(BATCH, self.config.states))) * jnp.sum(counts)
@@ -266,13 +212,7 @@ class Fitting:
     def loss(
         self, params: Params, drawn: Int[Array, " B"], step: Int[Array, ""]
     ) -> Float[Array, ""]:
-        """Mean error of a batch.
-
-        Args:
-          params: of the network.
-          drawn: `[B]` columns of the trials.
-          step: not used.
-        """
+        """Mean error of a batch."""
         del step
         trials = jax.tree.map(lambda x: x[:, drawn], self.trials)
         predicted = seconds(self.network, params, trials.observation, self.latent_size)

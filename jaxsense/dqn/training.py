@@ -6,18 +6,21 @@ Random numbers are drawn once for a whole chunk of epochs: in the loop they woul
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import DqnConfig
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key, Transition, pytree
-from jaxsense.dqn import losses, replay
-from jaxsense.dqn.environments import Environment
+from jaxsense.dqn import replay
+from jaxsense.dqn.map_mdp import MapMdp, Outcome
+from jaxsense.dqn.team_mdp import TeamMdp
 
 S = TypeVar("S")
 _EVALUATED = 10  # epochs
@@ -25,19 +28,54 @@ _FIRST_EPSILON = 1.0
 _FINAL_RATE = 0.01  # share of the learning rate that is left in the last epoch
 
 
+class Environment(Protocol, Generic[S]):
+    """An environment of one learner; a frozen pytree."""
+
+    @property
+    def agent(self) -> Any:
+        """The learner, see `dqn.policies.Agent`."""
+        ...
+
+    @property
+    def mdp(self) -> MapMdp | TeamMdp:
+        """Of one robot or of a team."""
+        ...
+
+    @property
+    def num_actions(self) -> int:
+        """A; the last action is NOP."""
+        ...
+
+    def reset(self, key: Key) -> S:
+        """A random first state."""
+        ...
+
+    def action_mask(self, state: S) -> Bool[Array, " A"]:
+        """Actions that exist."""
+        ...
+
+    def observe(self, state: S) -> Float[Array, " S"]:
+        """Input of the agent's network."""
+        ...
+
+    def step(
+        self, key: Key, state: S, s_tm1: Float[Array, " S"], action: Int[Array, ""]
+    ) -> tuple[S, Transition, Outcome]:
+        """The state after an action, the transition to learn from and the outcome.
+
+        `s_tm1` is what `observe` returned for the state.
+        """
+        ...
+
+
 @pytree
 class DqnState(Generic[S]):
     """State of a training between two chunks of epochs.
 
     Attributes:
-      params: of the Q-network.
-      target: of the target network.
-      optimiser: state of Adam.
-      replay: the replay memory.
       envs: `[E]` states of the environments.
       done: `[E]` bool, environments whose episode has ended.
       total_reward: `[E]` reward of each environment's episode so far.
-      epoch: `[]` int32 epochs so far.
     """
 
     params: Params
@@ -95,9 +133,6 @@ def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) 
     """The state before the first chunk: a new network, an empty replay, no episode started.
 
     Args:
-      key: random key of the network.
-      environment: what to learn in.
-      config: the settings.
       prepared: from `starts`; only its shapes matter.
     """
     envs = jax.tree.map(lambda x: jnp.zeros((config.num_envs, *x.shape[1:]), x.dtype), prepared)
@@ -121,11 +156,6 @@ def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
 
     A training prepares them once: a start simulates every look already taken, which costs far more
     than a step.
-
-    Args:
-      key: random key.
-      environment: what to learn in.
-      config: the settings.
     """
     return jax.vmap(environment.reset)(jax.random.split(key, config.num_starts))
 
@@ -133,16 +163,7 @@ def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
 def train(
     key: Key, environment: Environment[S], config: DqnConfig
 ) -> tuple[DqnState[S], EpochInfo]:
-    """Trains one agent by deep Q-learning; `vmap` over `key` for several seeds.
-
-    Args:
-      key: random key.
-      environment: what to learn in.
-      config: the settings.
-
-    Returns:
-      The last state and the `[epochs]` infos.
-    """
+    """Trains one agent by deep Q-learning; `vmap` over `key` for several seeds."""
     checks.require_key(key)
     init_key, start_key, chunk_key = jax.random.split(key, 3)
     prepared = starts(start_key, environment, config)
@@ -165,17 +186,10 @@ def train_chunk(
     """Trains for `config.chunk` epochs.
 
     Args:
-      key: random key.
-      environment: what to learn in.
-      config: the settings.
-      state: the current state.
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
         episode from a random one of its share.
       evaluate: `(key, parameters) -> []` total reward of the learned policy, called after every
         tenth epoch, or after the last if ten do not divide the chunk.
-
-    Returns:
-      The next state and the `[chunk]` infos.
     """
     for part in jax.tree.leaves(prepared):
         checks.require_shape("prepared", part, (config.num_starts, ...))
@@ -268,22 +282,14 @@ def _explore(
     draws: _Draws,
 ) -> tuple[S, jax.Array, Transition, jax.Array]:
     """Next states, which episodes have ended, transitions and `[A, E]` values before them."""
-    observations = jax.vmap(environment.observe, out_axes=-1)
-    s_tm1 = observations(started)
+    s_tm1 = jax.vmap(environment.observe, out_axes=-1)(started)
     values = environment.agent.values(params, s_tm1)
-    checks.require_shape("values of the agent", values, (environment.num_actions, None))
     highest = jnp.argmax(values, axis=0).astype(jnp.int32)
     a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), highest)
 
-    def step(key: Key, state: S, s_tm1: jax.Array, action: jax.Array):
-        after, learned, outcome = environment.step(key, state, s_tm1, action)
-        numbers = learned.a_tm1, learned.r_t, learned.discount_t
-        return after, (learned.s_tm1, learned.s_t), numbers, outcome
-
-    steps = jax.vmap(step, in_axes=(0, 0, -1, 0), out_axes=(0, -1, 0, 0))
-    envs, (s_tm1, s_t), numbers, outcome = steps(draws.step, started, s_tm1, a_tm1)
-    a_tm1, r_t, discount_t = numbers
-    transitions = Transition(s_tm1, a_tm1, r_t, discount_t, s_t)
+    columns = Transition(-1, 0, 0, 0, -1)  # pyright: ignore[reportArgumentType]
+    steps = jax.vmap(environment.step, in_axes=(0, 0, -1, 0), out_axes=(0, columns, 0))
+    envs, transitions, outcome = steps(draws.step, started, s_tm1, a_tm1)
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
@@ -307,8 +313,8 @@ def _learn(
     def loss(params: Params, batch: Transition) -> jax.Array:
         q_tm1 = environment.agent.q(params, batch.s_tm1)
         q_t = environment.agent.values(state.target, batch.s_t)
-        error = losses.td_error(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
-        return jnp.mean(losses.pseudo_huber(error))
+        error = td_error(q_tm1, batch.a_tm1, batch.r_t, batch.discount_t, q_t)
+        return jnp.mean(pseudo_huber(error))
 
     def update(carry, draws: jax.Array):
         params, optimiser_state = carry
@@ -339,3 +345,30 @@ def _restart(rows: jax.Array, envs: S, shares: S, done: jax.Array) -> S:
         return jnp.where(mask, share[jnp.arange(len(rows)), rows], env)
 
     return jax.tree.map(pick, envs, shares)
+
+
+def td_error(
+    q_tm1: Float[Array, "A ..."],
+    a_tm1: Int[Array, "..."],
+    r_t: Float[Array, "..."],
+    discount_t: Float[Array, "..."],
+    q_t: Float[Array, "A ..."],
+) -> Float[Array, "..."]:
+    """One-step Q-learning error (Mnih et al. 2015, Eq. 2) of one or many transitions.
+
+    Args:
+      discount_t: `[...]` discount factor, 0 where the episode ended.
+      q_t: `[A, ...]` the target network's values after the action; no gradient flows into them.
+    """
+    chex.assert_equal_shape([a_tm1, r_t, discount_t])
+    chex.assert_shape([q_tm1, q_t], (q_tm1.shape[0], *a_tm1.shape))
+    target = r_t + discount_t * jnp.max(q_t, axis=0)
+    # Cheaper than indexing, whose gradient is a scatter.
+    actions = jnp.arange(q_tm1.shape[0]).reshape(-1, *[1] * a_tm1.ndim)
+    value = jnp.sum(jnp.where(actions == a_tm1[None], q_tm1, 0.0), axis=0)
+    return jax.lax.stop_gradient(target) - value
+
+
+def pseudo_huber(error: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`sqrt(1 + e^2) - 1`: quadratic near zero, linear far away, smooth everywhere."""
+    return jnp.sqrt(1.0 + error**2) - 1.0

@@ -2,19 +2,19 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from mujoco import mjx
 
 from jaxsense.config import CONTROL_PERIOD, Search
 from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
-from jaxsense.mission.groups import where_due
-from jaxsense.mission.maps import Learned, map_of
-from jaxsense.mission.memory import Evidence
+from jaxsense.mission.maps import Evidence, Learned
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -40,6 +40,11 @@ _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
+_MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
+_NO_KIND = jnp.iinfo(jnp.int32).max
+
+Row = TypeVar("Row")
+Result = TypeVar("Result")
 
 
 @pytree
@@ -47,10 +52,8 @@ class Course:
     """Where a robot wants to move.
 
     Attributes:
-      phase: `[]` int32, what it is about, see `Robots`.
-      waypoint: `[2]` where its path leads next, in metres.
-      bearing: `[]` of its target, see `viewpoints.bearing`.
-      makes_room: `[]` bool, whether it makes room for another robot.
+      waypoint: where its path leads next, in metres.
+      bearing: of its target, see `viewpoints.bearing`.
     """
 
     phase: Int[Array, ""]
@@ -67,12 +70,6 @@ def approach(
 
     A robot need not get to the viewpoint itself if a look from nearby is new.
 
-    Args:
-      mission: the mission.
-      models: trained models.
-      state: the current state.
-      robot: index of the robot.
-
     Returns:
       The next state, and where the robot wants to move, see `steer`.
     """
@@ -86,7 +83,7 @@ def approach(
     to_goal = jnp.linalg.norm(state.roadmap.viewpoints[poi, view] - position)
     is_here = own.view == num_views
     modality = mission.modalities[robot]
-    apart = map_of(mission, state, robot).apart(position[None], poi, modality)[0]
+    apart = mission.map_of(state, robot).apart(position[None], poi, modality)[0]
     to_go = models.novelty.to_go(apart, modality)
     is_near = to_goal <= jnp.where(to_go > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
     is_there = is_here | (is_near & sees(mission, state, robot, poi))
@@ -100,22 +97,22 @@ def approach(
     is_stuck &= time - own.progress_at > STUCK_TIME
     is_back = (own.phase == BACKING) & (time >= own.backs_off_until)
 
-    failure = _fail(own, is_stuck)
+    attempts, excluded, gives_up = _fail(own, is_stuck)
     phase = jnp.select(
         [arrives, is_blocked, is_stuck, is_back], [FACING, IDLE, BACKING, IDLE], own.phase
     )
     makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
     makes_room &= time < state.faults.stops_at[robot]
-    blocked = failure.excluded.at[own.view].set(True)
+    blocked = excluded.at[own.view].set(True)
     course = Course(phase, waypoint, _bearing(mission, state, robot), makes_room)
     state = state.with_robot(
         robot,
         phase=phase,
-        attempts=failure.attempts,
-        unreachable=own.unreachable | failure.gives_up,
+        attempts=attempts,
+        unreachable=own.unreachable | gives_up,
         goals=own.goals - is_blocked,
         reached=own.reached + (arrives & ~is_here),
-        excluded=jnp.where(is_blocked, blocked, failure.excluded),
+        excluded=jnp.where(is_blocked, blocked, excluded),
         path_left=jnp.where(progresses, length, own.path_left),
         progress_at=jnp.where(progresses | arrives, time, own.progress_at),
         backs_off_until=jnp.where(is_stuck, time + RECOVERY_TIME, own.backs_off_until),
@@ -133,15 +130,6 @@ def steer(mission: Mission, state: MissionState, robot: Index, course: Course) -
     """Speeds that a robot wants: along its path, backing off, or turning.
 
     It senses where obstacles are, but has to trust its own pose for where the waypoint is.
-
-    Args:
-      mission: the mission.
-      state: the current state.
-      robot: index of the robot.
-      course: from `approach`.
-
-    Returns:
-      `[2]` wanted command, see `navigation`.
     """
     config, scene, phase = mission.config, state.scene, course.phase
     aim = localisation.aimed_at(course.waypoint, scene.poses[robot], state.pose_error[robot])
@@ -175,24 +163,14 @@ def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> Bool[
     return jnp.any(others(needs_room & is_near, robot))
 
 
-@pytree
-class _Failure:
-    """New `attempts` and `excluded` of a robot, and its target if the robot gives it up."""
-
-    attempts: Int[Array, ""]
-    excluded: Bool[Array, " V+1"]
-    gives_up: Bool[Array, " N"]
-
-
-def _fail(own: Robots, applies: Bool[Array, ""]) -> _Failure:
-    """Counts a failure of a robot at its viewpoint, if it `applies`."""
+def _fail(
+    own: Robots, applies: Bool[Array, ""]
+) -> tuple[Int[Array, ""], Bool[Array, " W"], Bool[Array, " N"]]:
+    """New `attempts` and `excluded` of a robot after a failure, and which PoI it gives up."""
     failures = own.attempts + applies
-    gives_up = applies & (failures >= ATTEMPTS)
-    return _Failure(
-        attempts=failures,
-        excluded=jnp.where(applies, own.excluded.at[own.view].set(True), own.excluded),
-        gives_up=gives_up & (jnp.arange(own.unreachable.shape[0]) == own.target),
-    )
+    excluded = jnp.where(applies, own.excluded.at[own.view].set(True), own.excluded)
+    is_target = jnp.arange(own.unreachable.shape[0]) == own.target
+    return failures, excluded, applies & (failures >= ATTEMPTS) & is_target
 
 
 @pytree
@@ -207,14 +185,6 @@ class _Aim:
     message_key: Key
 
 
-@pytree
-class _Look:
-    """Whether a scan detects its PoI, and what it changes if it does."""
-
-    detects: Bool[Array, ""]
-    learned: Learned
-
-
 @jax.named_scope("mission.scan")
 def scan(
     keys: Key,
@@ -223,43 +193,28 @@ def scan(
     states: MissionState,
     robot: Index,
 ) -> MissionState:
-    """Scans the PoI that a robot faces, and updates the map, in B missions side by side.
-
-    Args:
-      keys: `[B]` random keys.
-      mission: the mission.
-      models: trained models.
-      states: `[B]` current states.
-      robot: index of the robot, the same in all missions.
-
-    Returns:
-      The `[B]` next states.
-    """
+    """Scans the PoI that a robot faces, and updates the map, in B missions side by side."""
     aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
     of_robot = mission.config.modality_of_robot
     carried = sorted(set(of_robot))
-    # Rows that are not due; any content will do, since it is not written.
-    belief, log_posterior = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
-    evidence = None if states.memory is None else Evidence(log_posterior, log_posterior)
-    nothing = _Look(jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence))
-
-    # The choice of the sensor outside the batch: inside, all would scan.
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]
 
-    def look(rows: tuple[MissionState, _Aim], _) -> _Look:
+    def look(rows: tuple[MissionState, _Aim], _) -> tuple[Bool[Array, " S"], Learned]:
         states, aims = rows
         place = lambda scene: arenas.place(mission.world.arena, scene.layout, scene.poses)  # noqa: E731
         placed = jax.vmap(place)(states.scene)
-
-        def look_with(i: int) -> _Look:
-            look_one = functools.partial(_look, mission, models, robot, carried[i])
-            return jax.vmap(look_one)(states, aims, placed)
-
+        look_with = lambda i: jax.vmap(  # noqa: E731
+            functools.partial(_look, mission, models, robot, carried[i])
+        )(states, aims, placed)
+        # The choice of the sensor outside the batch: inside, all would scan.
         return call(look_with, which, len(carried))
 
+    # Rows that are not due; any content will do, since it is not written.
+    belief, log_posterior = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
+    evidence = None if states.memory is None else Evidence(log_posterior, log_posterior)
+    nothing = jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence)
     looks = where_due(aims.scans & ~states.done, look, nothing, (states, aims))
-    write = jax.vmap(lambda state, aim, look: _write(mission, state, aim, look, robot))
-    return write(states, aims, looks)
+    return jax.vmap(functools.partial(_write, mission, robot))(states, aims, *looks)
 
 
 @jax.named_scope("mission.aim")
@@ -298,43 +253,45 @@ def _look(
     state: MissionState,
     aim: _Aim,
     placed: mjx.Data,
-) -> _Look:
-    """Simulates a scan; it detects a PoI that is there if the detector is confident enough."""
+) -> tuple[Bool[Array, ""], Learned]:
+    """Whether a scan detects its PoI with enough confidence, and what it would change."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
     search = Search(*mission.config.mission.localisation.search)
     wide = tuple(searching.widened(each, search) for each in world.sensors)
     world = dataclasses.replace(world, sensors=wide)
-    time = mission.time(state)
+    time, bearing = mission.time(state), aim.bearing
     readings = worlds.scan_around(
-        aim.noise_key, world, scene, placed, robot, aim.bearing, modality, time
+        aim.noise_key, world, scene, placed, robot, bearing, modality, time
     )
-    is_blind = time >= state.faults.blind_at[robot]
-    readings = jnp.where(is_blind, sensor.blind, readings)
+    readings = jnp.where(time >= state.faults.blind_at[robot], sensor.blind, readings)
     found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance, search)
     is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
-    known = map_of(mission, state, robot)
+    known = mission.map_of(state, robot)
     apart = known.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]
     weight = models.novelty.weight(apart, modality)
-    return _Look(
-        detects=found.is_there & is_confident,
-        learned=known.learn(models, aim.poi, found.features, modality, weight),
-    )
+    learned = known.learn(models, aim.poi, found.features, modality, weight)
+    return found.is_there & is_confident, learned
 
 
 @jax.named_scope("mission.write")
 def _write(
-    mission: Mission, state: MissionState, aim: _Aim, look: _Look, robot: Index
+    mission: Mission,
+    robot: Index,
+    state: MissionState,
+    aim: _Aim,
+    detects: Bool[Array, ""],
+    learned: Learned,
 ) -> MissionState:
     """Records a scan; if it detects the PoI, updates the map and tells the other robots."""
-    poi, detects, learned = aim.poi, aim.scans & look.detects, look.learned
+    poi, detects = aim.poi, aim.scans & detects
     modality = mission.modalities[robot]
     own = state.robot(robot)
-    failure = _fail(own, aim.scans & ~detects)
+    attempts, excluded, gives_up = _fail(own, aim.scans & ~detects)
     state = state.with_robot(
         robot,
-        attempts=failure.attempts,
-        excluded=failure.excluded,
-        undetected=own.undetected | failure.gives_up,
+        attempts=attempts,
+        excluded=excluded,
+        undetected=own.undetected | gives_up,
         phase=jnp.where(aim.scans, IDLE, own.phase),
         # After a detection the same PoI is a new target.
         target=jnp.where(detects, mission.config.arena.num_pois, own.target),
@@ -363,3 +320,46 @@ def _write(
         version=state.version + detects,
         memory=memory,
     )
+
+
+@jax.named_scope("mission.where_due")
+def where_due(
+    due: Bool[Array, " B"],
+    function: Callable[[Row, Int[Array, ""]], Result],
+    before: Result,
+    inputs: Row,
+    kinds: Int[Array, " B"] | None = None,
+) -> Result:
+    """Applies a function to the rows of a batch that are due, one group of rows after another.
+
+    The rows of a group are of one kind, so that the function can branch on it: a `lax.switch`
+    inside a `vmap` would take all branches. Under a `vmap`, so does this function.
+
+    Args:
+      kinds: `[B]` int32, one kind by default.
+    """
+    of_row = jnp.zeros(len(due), jnp.int32) if kinds is None else kinds
+    total, number = len(due), jnp.sum(due)
+    size = min(total, max(_MIN_ROWS, total // 16))
+    order = jnp.argsort(jnp.where(due, of_row, _NO_KIND))
+
+    def rows_of(x: Shaped[Array, "B ..."], row: Int[Array, " S"]) -> Shaped[Array, "S ..."]:
+        return x.at[row].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    def advance(carry: tuple[jax.Array, Result]) -> tuple[jax.Array, Result]:
+        first, after = carry
+        index = first + jnp.arange(size)
+        row = rows_of(order, jnp.minimum(index, total - 1))
+        kind_of = jnp.where(index < number, rows_of(of_row, row), _NO_KIND)
+        kind = kind_of[0]
+        is_new = kind_of == kind
+        new = function(jax.tree.map(lambda x: rows_of(x, row), inputs), kind)
+        kept = jnp.where(is_new, row, total)  # drops the others
+
+        def put(x: Shaped[Array, "B ..."], new: Shaped[Array, "S ..."]) -> Shaped[Array, "B ..."]:
+            return x.at[kept].set(new, mode="drop", wrap_negative_indices=False)
+
+        return first + jnp.sum(is_new), jax.tree.map(put, after, new)
+
+    some_left = lambda carry: carry[0] < number  # noqa: E731
+    return jax.lax.while_loop(some_left, advance, (jnp.int32(0), before))[1]

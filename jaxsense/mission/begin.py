@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import PLANNING_RADIUS, Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.mission import memory, roadmap
+from jaxsense.mission import maps, roadmap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.mission.state import (
     IDLE,
@@ -40,9 +40,6 @@ def reset(
     """Starts a mission in a random arena with an empty map.
 
     Args:
-      key: random key, which alone determines the arena.
-      mission: the mission.
-      models: trained models; the map starts from the prior of their fusion.
       policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
       faults: which robots will fail; none by default.
       classes: `[N]` int32 classes of the PoIs; independent by default.
@@ -83,17 +80,8 @@ def start(
     """Starts a mission in a given arena with an empty map.
 
     Args:
-      mission: the mission.
-      models: trained models; the map starts from the prior of their fusion.
-      scene: PoIs, light and the robots' poses.
-      classes: `[N]` int32 classes of the PoIs.
-      policy: `[]` int32 index into `Mission.policies`.
-      faults: which robots will fail.
       paths: roadmap of the layout; computed by default.
       pose_error: `[R, 3]` errors of localisation, see `localisation.draw`; none by default.
-
-    Raises:
-      ValueError: if a class, the policy or a time is out of range.
     """
     config = mission.config
     num_robots, num_pois = len(config.carried), config.arena.num_pois
@@ -102,7 +90,10 @@ def start(
     checks.require_index("classes", classes, num_classes)
     checks.require_index("policy", policy, len(mission.policies))
     checks.require_shape("scene.poses", scene.poses, (num_robots, 3))
-    _check_faults(faults, num_robots)
+    for name, times in vars(faults).items():
+        checks.require_shape(f"faults.{name}", times, (num_robots,))
+        expected = "must be seconds, infinite for never"
+        checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
     own_maps = config.mission.communication.own_maps
     pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
@@ -123,22 +114,13 @@ def start(
             (num_pois, len(config.modalities), RECENT_LOOKS, 2), jnp.inf, jnp.float32
         ),
         version=jnp.int32(0),
-        memory=memory.empty(mission.modalities, num_classes) if own_maps else None,
+        memory=maps.empty(mission.modalities, num_classes) if own_maps else None,
         robots=_idle_robots(num_robots, paths),
         steps=jnp.int32(0),
         contacts=jnp.int32(0),
         min_clearance=jnp.float32(jnp.inf),
         done=jnp.bool_(False),
     )
-
-
-def _check_faults(faults: Faults, num_robots: int) -> None:
-    """Raises `ValueError` if a time is negative; there must be one for each robot."""
-    for name in ("stops_at", "blind_at"):
-        times = getattr(faults, name)
-        checks.require_shape(f"faults.{name}", times, (num_robots,))
-        expected = "must be seconds, infinite for never"
-        checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
 
 
 def _idle_robots(num_robots: int, paths: Roadmap) -> Robots:

@@ -14,10 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import MissionConfig
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn import rules, team_mdp
+from jaxsense.dqn import policies, team_mdp
 from jaxsense.dqn.policies import Known, Policy
-from jaxsense.dqn.team_mdp import Team
-from jaxsense.dqn.travel import Travel
+from jaxsense.dqn.team_mdp import Team, Travel
 from jaxsense.models import Models
 from jaxsense.vae.novelty import Novelty
 
@@ -29,10 +28,10 @@ class Opinion:
     """What a policy says to a robot that chooses.
 
     Attributes:
-      values: `[A]` of the A = N + 1 actions, NOP's last.
-      gains: `[R, N]` of each robot's look at each PoI: above 0 if it pays.
-      counts_time: `[]` bool, see `Policy`.
-      is_unordered: `[]` bool, see `Policy`; without it, the gains are 0.
+      values: of the A = N + 1 actions, NOP's last.
+      gains: of each robot's look at each PoI: above 0 if it pays.
+      counts_time: see `Policy`.
+      is_unordered: see `Policy`; without it, the gains are 0.
     """
 
     values: Float[Array, " A"]
@@ -43,20 +42,12 @@ class Opinion:
 
 @jax.named_scope("mission.ask")
 def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
-    """Asks a policy.
-
-    Args:
-      key: random key.
-      policy: the policy.
-      models: trained models.
-      known: what the robot knows.
-    """
+    """Asks a policy."""
     of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
-    num_robots, num_pois = known.times.shape
-    gains = jnp.zeros((num_robots, num_pois))
+    none, robots = jnp.zeros(known.times.shape), jnp.arange(len(known.times))
     return Opinion(
         values=policy.values(key, models, known),
-        gains=jax.vmap(of_robot)(jnp.arange(num_robots)) if policy.is_unordered else gains,
+        gains=jax.vmap(of_robot)(robots) if policy.is_unordered else none,
         counts_time=jnp.bool_(policy.counts_time(models.agent)),
         is_unordered=jnp.bool_(policy.is_unordered),
     )
@@ -64,20 +55,14 @@ def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
 
 @jax.named_scope("mission.choose")
 def choose(settings: MissionConfig, opinion: Opinion, known: Known) -> Int[Array, ""]:
-    """PoI that a robot chooses, N for NOP, or -1 if any value is NaN.
-
-    Args:
-      settings: the rules.
-      opinion: of the robot's policy.
-      known: what the robot knows; PoIs that are not present are never chosen.
-    """
+    """PoI that a robot chooses, N for NOP, or -1 if any value is NaN."""
     values, present = opinion.values, known.team.present
     # Values that include travel time need no order.
     tolerance = jnp.where(opinion.counts_time, 0.0, settings.equal_values)
     of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
     is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
     by_values = _by_values(known, is_best)
-    by_auction = jnp.argmax(rules.auction(opinion.gains, known.times, known.team, known.robot))
+    by_auction = jnp.argmax(policies.auction(opinion.gains, known.times, known.team, known.robot))
     is_auction = settings.auctions & opinion.is_unordered & ~opinion.counts_time
     choice = jnp.where(is_auction, by_auction, by_values)
     is_nan = jnp.any(jnp.isnan(of_pois)) | jnp.isnan(of_nop)
@@ -90,14 +75,8 @@ def times_to_new_looks(
     """Seconds until each robot has looked at each PoI from where a look is new.
 
     Args:
-      travel: the travel model, which leaves out the way to such a place.
-      novelty: how much of a look is new.
-      team: robots and PoIs at this moment.
       apart: distances of each robot from earlier looks by its sensor at each PoI, in metres;
         infinite for none.
-
-    Returns:
-      `[R, N]` seconds.
     """
     metres = jax.vmap(novelty.to_go)(apart, team.modality)
     return team_mdp.travel_times(travel, team) + metres / travel.speed
@@ -106,11 +85,8 @@ def times_to_new_looks(
 def _by_values(known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
     """One of the PoIs with the best values, by the rules; N if there is none."""
     team, robot = known.team, known.robot
-    pois, robots = jnp.arange(team.positions.shape[0]), jnp.arange(team.poses.shape[0])
     distance = jnp.linalg.norm(team.positions - team.poses[robot, :2][None], axis=-1)
-    heads = team.target[:, None] == pois[None]
-    is_others = jnp.any(heads & (robots != robot)[:, None], axis=0)
     # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
-    rank = distance + _KEPT * heads[robot] + _HEADED_FOR * is_others
+    rank = distance + _KEPT * team.heads[robot] + _HEADED_FOR * team.is_taken(robot)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, pois.shape[0])
+    return jnp.where(jnp.any(is_best), poi, len(distance))

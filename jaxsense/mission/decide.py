@@ -9,11 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import MARGIN
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.team_mdp import Team
-from jaxsense.dqn.travel import Travel
+from jaxsense.dqn.team_mdp import Team, Travel
 from jaxsense.mission import roadmap
-from jaxsense.mission.choice import Opinion, ask, choose, times_to_new_looks
-from jaxsense.mission.maps import map_of
+from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -36,36 +34,11 @@ _REPEATED = 1e3  # m, above any path, for places from which a look tells little
 
 @jax.named_scope("mission.is_due")
 def is_due(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
-    """Whether a robot must decide because it is idle or the map has changed.
-
-    Args:
-      mission: the mission.
-      state: the current state.
-      robot: index of the robot.
-    """
+    """Whether a robot must decide because it is idle or the map has changed."""
     own = state.robot(robot)
     is_under_way = (own.phase == DRIVING) | (own.phase == FACING)
-    has_news = map_of(mission, state, robot).version != own.decided_on
+    has_news = mission.map_of(state, robot).version != own.decided_on
     return (own.phase == IDLE) | (is_under_way & has_news)
-
-
-def decide(
-    key: Key, mission: Mission, models: Models, state: MissionState, robot: Index
-) -> MissionState:
-    """Asks a robot's policy if a decision is due, and sets out for a viewpoint of the PoI.
-
-    For many missions, `choices` and `set_out` are faster than a `vmap` of this.
-
-    Args:
-      key: random key.
-      mission: the mission.
-      models: trained models.
-      state: the current state.
-      robot: index of the robot.
-    """
-    alone = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
-    chosen = choices(key[None], mission, models, alone, robot, alone.policy[0])[0]
-    return set_out(mission, models, state, robot, chosen)
 
 
 @jax.named_scope("mission.choices")
@@ -77,114 +50,82 @@ def choices(
     robot: Index,
     policy: Int[Array, ""],
 ) -> Int[Array, " B"]:
-    """What a robot chooses in each of B missions that have the same policy.
-
-    Args:
-      keys: `[B]` random keys.
-      mission: the mission.
-      models: trained models.
-      states: `[B]` current states.
-      robot: index of the robot, the same in all missions.
-      policy: `[]` int32 index into `mission.policies`.
-
-    Returns:
-      `[B]` PoIs, see `choice.choose`.
-    """
-    policies, settings = [*mission.policies.values()], mission.config.mission
+    """What a robot chooses in each of B missions that have the same policy."""
+    policies = [*mission.policies.values()]
     known = jax.vmap(lambda state: known_to(mission, models, state, robot))(states)
-
-    def opinions_of(index: int) -> Opinion:
-        return jax.vmap(lambda key, known: ask(key, policies[index], models, known))(keys, known)
-
     # The choice of the policy outside the batch: inside, all would be asked.
-    opinions = call(opinions_of, policy, len(policies))
-    return jax.vmap(functools.partial(choose, settings))(opinions, known)
+    of_policy = lambda i: jax.vmap(lambda k, x: ask(k, policies[i], models, x))(keys, known)  # noqa: E731
+    opinions = call(of_policy, policy, len(policies))
+    return jax.vmap(functools.partial(choose, mission.config.mission))(opinions, known)
 
 
 @jax.named_scope("mission.set_out")
 def set_out(
     mission: Mission, models: Models, state: MissionState, robot: Index, chosen: Int[Array, ""]
 ) -> MissionState:
-    """Sets out for a viewpoint of the PoI that a robot has chosen, if a decision is due.
-
-    Args:
-      mission: the mission.
-      models: trained models.
-      state: the current state.
-      robot: index of the robot.
-      chosen: `[]` int32 PoI, N for NOP, or -1: then the robot fails, with -1 for its target.
-    """
-    own, config = state.robot(robot), mission.config
-    is_idle, decides = own.phase == IDLE, is_due(mission, state, robot)
+    """Sets out for a viewpoint of the PoI that a robot has chosen, if a decision is due."""
+    own, config, num_pois = state.robot(robot), mission.config, mission.config.arena.num_pois
+    decides = is_due(mission, state, robot)
     action = jnp.where(decides, chosen, own.target)
-    is_new = action != own.target
-    is_poi = (action >= 0) & (action < config.arena.num_pois)
-    sets_out = decides & (is_idle | is_new) & is_poi
+    is_new, poi = action != own.target, jnp.minimum(action, num_pois - 1)
+    wants = decides & ((own.phase == IDLE) | is_new) & (action >= 0) & (action < num_pois)
 
     # Failures belong to one target.
     excluded, attempts = jnp.where(is_new, False, own.excluded), jnp.where(is_new, 0, own.attempts)
     found = _best_view(mission, models, state, robot, action, excluded)
-    view, length = found.view, found.length
-    has_path, is_exhausted = jnp.isfinite(length), length >= _REPEATED
-    exhausts = sets_out & has_path & is_exhausted
+    is_exhausted, no_path = found.length >= _REPEATED, ~jnp.isfinite(found.length)
+    sets_out = wants & ~is_exhausted & ~found.waits
+    exhausts = wants & is_exhausted & ~no_path
     # Robots that wait for each other make room.
-    backs_off, time = sets_out & found.waits, mission.time(state)
+    backs_off, time = wants & found.waits, mission.time(state)
     attempts += backs_off
-    gives_up = sets_out & ~has_path
-    gives_up |= backs_off & (attempts >= ATTEMPTS)
-    sets_out_now = sets_out & ~is_exhausted & ~found.waits
-    poi = jnp.minimum(action, config.arena.num_pois - 1)
-    nothing_left = decides & (action == config.arena.num_pois)
+    gives_up = (wants & no_path) | (backs_off & (attempts >= ATTEMPTS))
+
     # Obstacles may have moved: before it ends, a robot retries the PoIs where it was stuck.
+    nothing_left = decides & (action == num_pois)
     position = state.believed_poses[robot, :2]
-    reachable = roadmap.reachable(config, state.scene.layout, state.roadmap, position)
-    stuck_at = own.unreachable & reachable
+    stuck_at = own.unreachable & roadmap.reachable(
+        config, state.scene.layout, state.roadmap, position
+    )
     tries_again = nothing_left & jnp.any(stuck_at) & ~own.tried_again
-    ends, given_up = nothing_left & ~tries_again, own.unreachable & ~(stuck_at & tries_again)
+    given_up = own.unreachable & ~(stuck_at & tries_again)
+
     # Looks from the current position are not goals; an unreachable PoI is a missed goal.
     num_views = state.roadmap.viewpoints.shape[1]
-    is_goal = (sets_out_now & (view < num_views)) | gives_up
-    to_view = state.roadmap.to_viewpoint(poi, jnp.minimum(view, num_views - 1))
+    is_goal = (sets_out & (found.view < num_views)) | gives_up
     was_needless = decides & is_new & (own.phase == DRIVING) & (own.view < num_views)
+    to_view = state.roadmap.to_viewpoint(poi, jnp.minimum(found.view, num_views - 1))
+    ends, waits = nothing_left & ~tries_again, gives_up | exhausts | tries_again
     return state.with_robot(
         robot,
         phase=jnp.select(
-            [action < 0, ends, sets_out_now, gives_up | exhausts | tries_again, backs_off],
+            [action < 0, ends, sets_out, waits, backs_off],
             [FAILED, ENDED, DRIVING, IDLE, BACKING],
             own.phase,
         ),
         target=action,
-        view=jnp.where(sets_out_now, view, own.view),
-        to_view=jnp.where(sets_out_now, to_view, own.to_view),
-        decided_on=jnp.where(decides, map_of(mission, state, robot).version, own.decided_on),
+        view=jnp.where(sets_out, found.view, own.view),
+        to_view=jnp.where(sets_out, to_view, own.to_view),
+        decided_on=jnp.where(decides, mission.map_of(state, robot).version, own.decided_on),
         excluded=jnp.where(decides, found.excluded, own.excluded),
         attempts=attempts,
         backs_off_until=jnp.where(backs_off, time + RECOVERY_TIME, own.backs_off_until),
         unreachable=jnp.where(gives_up, given_up.at[poi].set(True), given_up),
         exhausted=own.exhausted.at[poi].set(own.exhausted[poi] | exhausts),
         tried_again=own.tried_again | tries_again,
-        path_left=jnp.where(sets_out_now, length, own.path_left),
-        progress_at=jnp.where(sets_out_now, time, own.progress_at),
+        path_left=jnp.where(sets_out, found.length, own.path_left),
+        progress_at=jnp.where(sets_out, time, own.progress_at),
         goals=own.goals + is_goal - was_needless,
     )
 
 
 def known_to(mission: Mission, models: Models, state: MissionState, robot: Index) -> Known:
-    """Knowledge of a robot that chooses, without the PoIs it has given up.
-
-    Args:
-      mission: the mission.
-      models: trained models.
-      state: the current state.
-      robot: index of the robot.
-    """
-    robots = state.robots
-    given_up = robots.unreachable[robot] | robots.undetected[robot] | robots.exhausted[robot]
-    phase, own = state.robots.phase, map_of(mission, state, robot)
+    """Knowledge of a robot that chooses, without the PoIs it has given up."""
+    mine, phase, own = state.robot(robot), state.robots.phase, mission.map_of(state, robot)
     known = own.read(models)
     team = Team(
         positions=state.scene.layout.position,
-        present=~given_up,
+        present=~(mine.unreachable | mine.undetected | mine.exhausted),
         poses=state.believed_poses,
         modality=mission.modalities,
         works=(phase != ENDED) & (phase != FAILED),
@@ -211,10 +152,10 @@ class _View:
     """A viewpoint to look at a PoI from.
 
     Attributes:
-      view: `[]` int32, V for the robot's current position.
-      length: `[]` metres of the path there, `_REPEATED` and more if no look from anywhere is new.
-      excluded: `[V + 1]` bool, none if all from which a look is new have been.
-      waits: `[]` bool, whether all of these have been, and robots still occupy some of them.
+      view: V for the robot's current position.
+      length: metres of the path there, `_REPEATED` and more if no look from anywhere is new.
+      excluded: none if all from which a look is new have been.
+      waits: whether all of these have been, and robots still occupy some of them.
     """
 
     view: Int[Array, ""]
@@ -237,11 +178,11 @@ def _best_view(
     poi = jnp.minimum(target, config.arena.num_pois - 1)
     position, modality = state.believed_poses[robot, :2], mission.modalities[robot]
     length = roadmap.lengths(config, scene.layout, state.roadmap, position, poi)
-    positions, margin = state.roadmap.viewpoints[poi], MARGIN
-    is_free = _room(mission, state, robot, poi, positions, margin) > 0
+    positions = state.roadmap.viewpoints[poi]
+    is_free = _room(mission, state, robot, poi, positions, MARGIN) > 0
     length += jnp.where(is_free, 0.0, _DETOUR)
     here = jnp.where(sees(mission, state, robot, poi), 0.0, jnp.inf)
-    known = map_of(mission, state, robot)
+    known = mission.map_of(state, robot)
     apart = known.apart(jnp.concatenate([positions, position[None]]), poi, modality)
     is_new = models.novelty.to_go(apart, modality) <= 0
     # A robot at a viewpoint would look from where it stands.
@@ -260,15 +201,7 @@ def _best_view(
 def is_taken(
     mission: Mission, state: MissionState, robot: Index, poi: Int[Array, ""], view: Int[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether another robot stands at a viewpoint or in the view from it.
-
-    Args:
-      mission: the mission.
-      state: the current state.
-      robot: index of the robot that wants to go there.
-      poi: index of the PoI.
-      view: index of the viewpoint.
-    """
+    """Whether another robot stands at a viewpoint or in the view from it."""
     position = state.roadmap.viewpoints[poi, view][None]
     return _room(mission, state, robot, poi, position, MARGIN)[0] <= 0
 
@@ -276,14 +209,7 @@ def is_taken(
 def sees(
     mission: Mission, state: MissionState, robot: Index, poi: Int[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether a PoI is in range of a robot and no static object occludes it.
-
-    Args:
-      mission: the mission.
-      state: the current state.
-      robot: index of the robot.
-      poi: index of the PoI.
-    """
+    """Whether a PoI is in range of a robot and no static object occludes it."""
     config, position = mission.config, state.believed_poses[robot, :2]
     distance = jnp.linalg.norm(state.scene.layout.position[poi] - position)
     # A robot may be nearer than it believes.

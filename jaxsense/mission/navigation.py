@@ -7,13 +7,13 @@ goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config import PLANNING_RADIUS, ArenaConfig
-from jaxsense.core import checks
 from jaxsense.core.types import Index, others, product
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
@@ -45,12 +45,8 @@ def ramp(
     Turning takes motor force from forward acceleration.
 
     Args:
-      command: `[..., 2]` current command.
       wanted: `[..., 2]` wanted command, clipped to the limits of speed and turn rate.
       seconds: how long the command may change.
-
-    Returns:
-      `[..., 2]` next command.
     """
     forward = jnp.clip(wanted[..., 0], -amiro.MAX_SPEED, amiro.MAX_SPEED) - command[..., 0]
     turn = jnp.clip(wanted[..., 1], -amiro.MAX_TURN_RATE, amiro.MAX_TURN_RATE) - command[..., 1]
@@ -69,11 +65,6 @@ def face(bearing: Float[Array, ""]) -> Float[Array, "2"]:
 def clearance(arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]) -> Float[Array, " R"]:
     """Free distance around each robot, exact for the actual shapes of the PoIs.
 
-    Args:
-      arena: its sizes.
-      layout: the PoIs.
-      poses: `[R, 3]` of the robots.
-
     Returns:
       `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative inside one.
     """
@@ -85,15 +76,10 @@ def clearances(
 ) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
     """Free distance around each robot as in `clearance`, to what stands and to other robots.
 
-    Args:
-      arena: its sizes.
-      layout: the PoIs.
-      poses: `[R, 3]` of the robots.
-
     Returns:
       `[R]` metres to the nearest wall or PoI, and `[R]` to the nearest robot.
     """
-    checks.require_shape("poses", poses, (None, 3))
+    chex.assert_shape(poses, (None, 3))
     x, y = poses[:, :1], poses[:, 1:2]
     to_wall = arena.side / 2 - jnp.max(jnp.abs(poses[:, :2]), axis=-1)
 
@@ -165,21 +151,10 @@ def drive_to(
     plus a penalty within the inflation around obstacles.
 
     Args:
-      arena: its sizes.
-      layout: positions of the PoIs; their shapes are not used.
-      poses: `[R, 3]` of all robots.
-      commands: `[R, 2]` of all robots.
-      robot: index of the one to drive.
       waypoint: `[2]` in metres.
       seconds: how long the robot keeps the command.
-      backs_off: `[]` bool, seek as much room as possible within half the horizon instead.
-
-    Returns:
-      `[2]` wanted command.
     """
-    checks.require_shape("waypoint", waypoint, (2,))
-    checks.require_shape("poses", poses, (None, 3))
-    checks.require_shape("commands", commands, (len(poses), 2))
+    chex.assert_shape([waypoint, poses, commands], [(2,), (None, 3), (len(poses), 2)])
     pose, present = poses[robot], commands[robot]
     arcs = _arcs(present[1], seconds)
     frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
@@ -285,8 +260,6 @@ def sidestep(
     """Position to head for on a straight line that another robot may block.
 
     Args:
-      arena: its sizes.
-      layout: positions of the PoIs.
       position: `[2]` of the robot, in metres.
       waypoint: `[2]` where it is going, in metres.
       blocking: `[K, 2]` positions of the other robots, in metres.

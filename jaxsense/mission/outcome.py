@@ -1,14 +1,20 @@
-"""Ends and results of missions."""
+"""Cases to play missions with, and their ends and results."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from jaxsense.config import CONTROL_PERIOD
+from jaxsense.config import CONTROL_PERIOD, Config, ConfigError
+from jaxsense.config.scene import require_words
 from jaxsense.core import checks
 from jaxsense.dqn import rewards
-from jaxsense.mission.state import ENDED, FAILED, Mission, MissionState
+from jaxsense.dqn.policies import POLICIES, Policy, Values, table
+from jaxsense.mission.state import ENDED, FAILED, Faults, Mission, MissionState, no_faults
 from jaxsense.models import Models
+from jaxsense.sim import sensors
 
 REASONS = (
     "running",
@@ -24,6 +30,69 @@ REASONS = (
 to even when it retried; `undetected`: it gave one up after looks that showed nothing;
 `exhausted`: it left one at which looks paid, but none from anywhere would have been new;
 `robot failed`: the others finished."""
+
+
+FAULT_TIME = 6.0  # s
+_FAULTS = ("alone", "stops", "blind")
+_TAKEN = ("all", "policies", "bytes_per_detection")  # by `evaluate` and by the summary
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A condition to play missions in: a policy, and faults of robots."""
+
+    policy: int
+    faults: Faults
+
+
+@checks.typed
+def require_playable(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+    """Checks that missions can be made and their policies exist, before anything is trained."""
+    sensors.make(config)
+    known = table(policies)
+    _require_names(known)
+    if not set(config.mission.policies) <= set(known):
+        reason = f"must be among {', '.join(known)}"
+        raise ConfigError("mission.policies", config.mission.policies, reason)
+
+
+def _require_names(policies: Iterable[str]) -> None:
+    """Raises `ConfigError` if a policy's name is no word, or names a fault or something else."""
+    names = dict.fromkeys(policies)
+    require_words(names, "policies")
+    for name in filter(is_fault, names):
+        raise ConfigError("policies", name, f"must not end in _{', _'.join(_FAULTS)}")
+    for name in _TAKEN:
+        if name in names:
+            raise ConfigError("policies", name, f"must not be {', '.join(_TAKEN)}")
+
+
+def is_fault(case: str) -> bool:
+    """Tells from the name of a case whether a robot is alone, stops or goes blind in it."""
+    checks.require_type("case", case, str, "as from cases")
+    return case.endswith(tuple(f"_{fault}" for fault in _FAULTS))
+
+
+@checks.typed
+def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]:
+    """Lists a case for every policy, for each robot alone, and for each robot that fails.
+
+    Each policy is a case. In `ROBOT_alone` all other robots stand still from the start; in
+    `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. Robots are
+    named as in `Config.robot_names`. Cases with faults use the latent policy.
+    """
+    healthy, names = no_faults(config), tuple(policies)
+    _require_names(names)
+    found = {name: Case(policy, healthy) for policy, name in enumerate(names)}
+    latent = names.index("latent")
+    for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
+        own = jnp.arange(len(config.carried)) == r
+        alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
+        failing = jnp.where(own, FAULT_TIME, jnp.inf)
+        found[f"{name}_alone"] = Case(latent, alone)
+        found[f"{name}_stops"] = Case(latent, Faults(failing, healthy.blind_at))
+        found[f"{name}_blind"] = Case(latent, Faults(healthy.stops_at, failing))
+    return found
 
 
 @checks.typed
@@ -50,11 +119,6 @@ def reason(state: MissionState) -> Int[Array, ""]:
 def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, PyTree[Array]]:
     """Computes the metrics of a finished mission.
 
-    Args:
-      mission: the mission.
-      models: trained models.
-      state: the last state.
-
     Returns:
       `classes`: `[N]` int32 true classes.
       `seen`: `[N]` bool, PoIs that were detected; others are neither right nor ambiguous.
@@ -78,15 +142,16 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
     of_truth = jnp.take_along_axis(probabilities, state.classes[:, None], axis=1)[:, 0]
     is_seen = jnp.any(state.seen, axis=-1)
     is_right = is_seen & (shown == state.classes)
-    told = {}
-    for modality in config.modalities:
+
+    def told(modality: str) -> Array:
         labels = jnp.array(config.label_of_class(modality))
-        told[modality] = jnp.mean(is_seen & (labels[shown] == labels[state.classes]))
+        return jnp.mean(is_seen & (labels[shown] == labels[state.classes]))
+
     robots = state.robots
     return {
         "classes": state.classes,
         "is_right": is_right,
-        "told": told,
+        "told": {modality: told(modality) for modality in config.modalities},
         "ambiguous": is_seen & (jnp.sum(plausible, axis=-1) > 1),
         "confidence": jnp.max(probabilities, axis=-1),
         "nll": -jnp.log(of_truth),

@@ -31,14 +31,14 @@ class Roadmap:
     """Paths through one layout, with K nodes and V viewpoints of each PoI.
 
     Attributes:
-      nodes: `[K, 2]` positions in metres.
-      viewpoints: `[N, V, 2]` positions to look at a PoI from, in metres.
-      between: `[K, K]` length of the shortest path from each node to each other, in metres;
-        0 from a node to itself, infinite if there is none or a robot cannot stand at one of them.
-      is_next: `[N, V, K]` bool, whether a path may lead straight from each node to each viewpoint;
-        never to one that is not free.
-      leads: `[N, K]` bool, whether a path leads from each node to any viewpoint of each PoI.
-      is_free: `[N, V]` bool, viewpoints with room for a robot and a view of the PoI.
+      nodes: positions in metres.
+      viewpoints: positions to look at a PoI from, in metres.
+      between: length of the shortest path from each node to each other, in metres; 0 from a node
+        to itself, infinite if there is none or a robot cannot stand at one of them.
+      is_next: whether a path may lead straight from each node to each viewpoint; never to one
+        that is not free.
+      leads: whether a path leads from each node to any viewpoint of each PoI.
+      is_free: viewpoints with room for a robot and a view of the PoI.
     """
 
     nodes: Float[Array, "K 2"]
@@ -51,10 +51,6 @@ class Roadmap:
     def last(self, poi: Index, view: Index | slice) -> Float[Array, "... K"]:
         """Lengths of straight lines from the nodes to viewpoints, the last parts of paths.
 
-        Args:
-          poi: index of the PoI.
-          view: index of the viewpoint, or a slice.
-
         Returns:
           `[..., K]` metres; infinite where no path may lead straight.
         """
@@ -66,10 +62,6 @@ class Roadmap:
     def to_viewpoint(self, poi: Index, view: Index) -> Float[Array, " K"]:
         """Lengths of the shortest paths from the nodes to a viewpoint, in metres.
 
-        Args:
-          poi: index of the PoI.
-          view: index of the viewpoint.
-
         Returns:
           `[K]` metres; infinite where there is none.
         """
@@ -78,15 +70,7 @@ class Roadmap:
 
 @checks.typed
 def build(config: Config, layout: Layout) -> Roadmap:
-    """Computes the viewpoints of a layout and the paths to them.
-
-    Args:
-      config: all settings.
-      layout: the PoIs.
-
-    Raises:
-      ValueError: if the layout is not that of one arena of `config`.
-    """
+    """Computes the viewpoints of a layout and the paths to them."""
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
     arena = config.arena
     radius = _radius(config)
@@ -117,12 +101,8 @@ def lengths(
     Ignores other robots: they will be elsewhere, or make room.
 
     Args:
-      config: all settings.
-      layout: the PoIs.
-      roadmap: of the layout.
       position: `[2]` of a robot, in metres; if it is closer to a PoI than planning allows, paths
         lead away from the PoI.
-      poi: index of the PoI.
 
     Returns:
       `[V]` metres; infinite where no path exists.
@@ -145,9 +125,6 @@ def reachable(
     """Marks the PoIs that have a reachable viewpoint, see `lengths`.
 
     Args:
-      config: all settings.
-      layout: the PoIs.
-      roadmap: of the layout.
       position: `[2]` of a robot, in metres.
     """
     checks.require_shape("position", position, (2,))
@@ -174,14 +151,8 @@ def next_waypoint(
     """Finds length and first waypoint of the shortest path to one viewpoint.
 
     Args:
-      config: all settings.
-      layout: the PoIs.
-      roadmap: of the layout.
-      to_view: `[K]` lengths from the nodes, see `Roadmap.to_viewpoint`.
       position: `[2]` of a robot in metres, see `lengths`.
       others: `[S, 2]` positions of standing robots, in metres, which cannot be waypoints.
-      poi: index of the PoI.
-      view: index of the viewpoint.
 
     Returns:
       `[]` length in metres, infinite if no path exists, and `[2]` the waypoint, to which the
@@ -208,7 +179,6 @@ def _first(
     goals: Float[Array, "G 2"],
 ) -> tuple[Float[Array, " G"], Float[Array, " K"]]:
     """Lengths of free straight lines from a position to goals and to all nodes, else infinite."""
-    checks.require_shape("position", position, (2,))
     ends = jnp.concatenate([goals, roadmap.nodes])
     length = _straight(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
     return length[: len(goals)], length[len(goals) :]

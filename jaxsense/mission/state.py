@@ -12,7 +12,7 @@ from jaxsense.config.section import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
-from jaxsense.mission.memory import Memory
+from jaxsense.mission.maps import Contents, Memory, OwnMap, SharedMap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
 from jaxsense.sim import sensors
@@ -35,8 +35,8 @@ class Faults:
     """Times at which robots fail, in seconds from the start; infinite for never.
 
     Attributes:
-      stops_at: `[R]` when the robot stops for good.
-      blind_at: `[R]` when its sensor goes blind, unknown to the robot.
+      stops_at: when the robot stops for good.
+      blind_at: when its sensor goes blind, unknown to the robot.
     """
 
     stops_at: Float[Array, " R"]
@@ -48,28 +48,20 @@ class Robots:
     """State of the robots, `[R]` each unless another shape is listed.
 
     Attributes:
-      phase: int32, one of IDLE to FAILED.
-      target: int32 PoI, N for none, or -1 if the policy's values were NaN.
-      view: int32 viewpoint of the target, or V for the robot's current position.
-      to_view: `[R, K]` length of the path to it from each node of the roadmap, in metres.
-      command: `[R, 2]` current speeds, see `navigation`.
-      wanted: `[R, 2]` target speeds.
-      decided_on: int32 version of the map at the last decision.
-      excluded: `[R, V + 1]` bool, viewpoints of the target that have failed or were occupied.
-      attempts: int32 failures at the target.
+      target: PoI, N for none, or -1 if the policy's values were NaN.
+      view: viewpoint of the target, or V for the robot's current position.
+      to_view: length of the path to it from each node of the roadmap, in metres.
+      decided_on: version of the map at the last decision.
+      excluded: viewpoints of the target that have failed or were occupied.
       path_left: metres left to the viewpoint at the last progress.
-      progress_at: seconds, time of the last progress.
-      backs_off_until: seconds.
-      unreachable: `[R, N]` bool, PoIs given up because no path leads there, or because the robot
-        was stuck on the last attempt or found all viewpoints occupied.
-      undetected: `[R, N]` bool, PoIs given up after a last look that showed nothing.
-      exhausted: `[R, N]` bool, PoIs at which no look of the robot's would be new.
-      tried_again: bool, the robot has already retried the PoIs it had given up.
-      goals: int32 viewpoints that the robot set out for and unreachable PoIs, except goals that a
-        new decision or another robot made obsolete.
-      reached: int32 goals reached.
-      looks: int32 scans.
-      detections: int32 scans that updated the map.
+      unreachable: PoIs given up because no path leads there, or because the robot was stuck on
+        the last attempt or found all viewpoints occupied.
+      undetected: PoIs given up after a last look that showed nothing.
+      exhausted: PoIs at which no look of the robot's would be new.
+      tried_again: the robot has already retried the PoIs it had given up.
+      goals: viewpoints that the robot set out for and unreachable PoIs, except goals that a new
+        decision or another robot made obsolete.
+      detections: scans that updated the map.
     """
 
     phase: Int[Array, " R"]
@@ -99,28 +91,21 @@ class MissionState:
     """State of one mission.
 
     Attributes:
-      scene: PoIs, light and the robots' poses.
-      pose_error: `[R, 3]` pose that each robot believes it has minus its true pose: x [m], y [m]
-        and yaw [rad].
-      classes: `[N]` int32 true classes, hidden from the robots.
-      roadmap: paths through the layout.
-      faults: which robots will fail.
-      policy: `[]` int32 index into `Mission.policies`.
-      velocity: `[R, 3]` time derivative of the poses.
-      warmstart: `[3 R]` MJX's last accelerations.
-      belief: `[N, D]` the map of all looks; robots that keep maps of their own decide by these.
-      log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes, for the
-        policies `bayes` and `optimal`.
-      times_seen: `[N, M]` int32, number of detections of each PoI by each modality.
-      looked_from: `[N, M, RECENT_LOOKS, 2]` places from which each modality has last detected each
-        PoI, as the robots believe, in metres; infinite for none.
-      version: `[]` int32, number of updates of the map.
+      pose_error: pose that each robot believes it has minus its true pose: x [m], y [m] and yaw
+        [rad].
+      classes: true classes, hidden from the robots.
+      policy: index into `Mission.policies`.
+      warmstart: MJX's last accelerations.
+      belief: the map of all looks; robots that keep maps of their own decide by these.
+      log_posterior: logarithms of the classes' probabilities by exact Bayes, for the policies
+        `bayes` and `optimal`.
+      times_seen: number of detections of each PoI by each modality.
+      looked_from: places from which each modality has last detected each PoI, as the robots
+        believe, in metres; infinite for none.
       memory: the looks that each robot knows of; None where all robots share one map.
-      robots: their state.
-      steps: `[]` int32 control periods since the start.
-      contacts: `[]` int32 control periods in which a robot touched something.
-      min_clearance: `[]` smallest free distance around any robot since the start, in metres.
-      done: `[]` bool.
+      steps: control periods since the start.
+      contacts: control periods in which a robot touched something.
+      min_clearance: smallest free distance around any robot since the start, in metres.
     """
 
     scene: Scene
@@ -164,12 +149,7 @@ class MissionState:
         return jnp.where(moves[:, None], 1e3, others(self.believed_poses[:, :2], robot))
 
     def with_robot(self, robot: Index, **changes: jax.Array) -> "MissionState":
-        """Changes one robot.
-
-        Args:
-          robot: its index.
-          **changes: new values of fields of `Robots`, without their first axis.
-        """
+        """Changes one robot."""
         changed = {n: getattr(self.robots, n).at[robot].set(x) for n, x in changes.items()}
         return dataclasses.replace(self, robots=dataclasses.replace(self.robots, **changed))
 
@@ -179,18 +159,10 @@ class Record:
     """Record of one control period, for plots and tests.
 
     Attributes:
-      time: `[]` seconds from the start, at its end.
-      poses: `[R, 3]` at its end.
-      command: `[R, 2]` at its end.
-      wanted: `[R, 2]` during it.
-      phase: `[R]` int32.
-      target: `[R]` int32.
-      scanned: `[R]` bool, the robot took a scan.
-      detected: `[R]` bool, the scan updated the map.
-      belief: `[N, D]` the map.
-      seen: `[N, M]` bool.
-      clearance: `[]` smallest free distance around any robot during it, in metres. After
-        the mission's end, of a motion that the state does not take.
+      scanned: the robot took a scan.
+      detected: the scan updated the map.
+      clearance: smallest free distance around any robot during it, in metres. After the mission's
+        end, of a motion that the state does not take.
     """
 
     time: Float[Array, ""]
@@ -212,8 +184,7 @@ class Mission:
 
     Attributes:
       world: the simulation, with contacts or without.
-      free_arena: the same robots in an empty arena, see `motion.move`.
-      config: all settings.
+      free_arena: the same robots in an empty arena, see `rollout.move`.
       policies: by name; a mission's policy is an index into them.
     """
 
@@ -223,11 +194,7 @@ class Mission:
     policies: FrozenDict[str, Policy]
 
     def policy(self, name: str) -> int:
-        """The index of a policy.
-
-        Raises:
-          ConfigError: if there is no policy of this name.
-        """
+        """The index of a policy."""
         if name not in self.policies:
             raise ConfigError("policy", name, f"must be one of {', '.join(self.policies)}")
         return [*self.policies].index(name)
@@ -246,6 +213,14 @@ class Mission:
         """Seconds since the start."""
         return state.steps * CONTROL_PERIOD
 
+    def map_of(self, state: MissionState, robot: Index) -> SharedMap | OwnMap:
+        """The map that a robot decides by."""
+        if state.memory is None:
+            contents = Contents(state.belief, state.log_posterior, state.times_seen)
+            return SharedMap(contents, state.looked_from, state.version)
+        is_known = state.memory.known_to(robot, self.time(state))
+        return OwnMap(state.memory, is_known, self.config.arena.num_pois)
+
 
 @checks.typed
 def make_mission(
@@ -259,8 +234,6 @@ def make_mission(
 
     Args:
       config: all settings; numbers that are declared `Traced` may be traced.
-      policies: custom policies by name, in addition to `dqn.POLICIES`.
-      contacts: whether robots collide with PoIs, with each other and with the walls.
       arenas: `world.arena` and `free_arena` of a mission with the same sizes, to reuse; by default
         they are compiled, which cannot be traced.
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int
 
 from jaxsense.config import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES, Config
 from jaxsense.core import checks
-from jaxsense.mission.memory import MOST_LOOKS
+from jaxsense.mission.maps import MOST_LOOKS
 from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.run import devices
 from jaxsense.run.devices import ALONE, Workers

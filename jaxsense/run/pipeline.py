@@ -10,7 +10,7 @@ import numpy as np
 from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
-from jaxsense.dqn.reference import has_optimum
+from jaxsense.dqn.episodes import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints

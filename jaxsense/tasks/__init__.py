@@ -2,7 +2,6 @@
 
 from jaxsense.tasks.environment import Environment as Environment
 from jaxsense.tasks.environment import TimeStep as TimeStep
-from jaxsense.tasks.learning import greedy as greedy
 from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
 from jaxsense.tasks.pretrained import Origin as Origin
 from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
@@ -15,6 +14,7 @@ from jaxsense.tasks.score import Estimate as Estimate
 from jaxsense.tasks.score import Recurrent as Recurrent
 from jaxsense.tasks.score import Score as Score
 from jaxsense.tasks.score import estimate as estimate
+from jaxsense.tasks.score import greedy as greedy
 from jaxsense.tasks.score import mean_return as mean_return
 from jaxsense.tasks.score import on_host as on_host
 from jaxsense.tasks.score import score as score

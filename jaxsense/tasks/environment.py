@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.config import require_32_bits
-from jaxsense.core.types import Key, pytree
+from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_agent import observation
 from jaxsense.dqn.map_mdp import MapMdp, MapState
@@ -29,11 +29,7 @@ class Scaling:
 
     offset: jax.Array
     scale: jax.Array
-
-    @property
-    def bound(self) -> float:
-        """Observations are within plus and minus this."""
-        return CLIP
+    bound = CLIP
 
     def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
         """`[N * F]` scaled from `[N, F]`, PoI by PoI."""
@@ -51,8 +47,6 @@ class TimeStep:
     """Output of a step: observation, reward, and whether the episode has ended.
 
     Attributes:
-      observation: `[S]` float32 after the action.
-      reward: `[]` float32.
       terminated: `[]` bool, the agent has ended the episode.
       truncated: `[]` bool, the episode has reached its limit of steps.
     """
@@ -68,10 +62,11 @@ class Environment(abc.ABC):
     """An environment in which one policy makes all choices; a pytree.
 
     Attributes:
-      mdp: the MDP.
+      bound: observations are within plus and minus this.
     """
 
     mdp: MapMdp | TeamMdp
+    bound = float("inf")
 
     @property
     def num_actions(self) -> int:
@@ -84,85 +79,58 @@ class Environment(abc.ABC):
         return int(self.mdp.max_steps)
 
     @property
-    @abc.abstractmethod
     def observation_size(self) -> int:
-        """S."""
+        """S, the features of all PoIs."""
+        return self.mdp.num_features * self.mdp.map.num_pois
 
-    @property
-    @abc.abstractmethod
-    def bound(self) -> float:
-        """Observations are within plus and minus this."""
-
-    @abc.abstractmethod
     def reset(self, key: Key) -> tuple[Float[Array, " S"], PyTree]:
-        """Starts an episode.
+        """Starts an episode: the observation, and the state."""
+        require_32_bits()
+        state = self.start(key)
+        return self.observe(state), state
 
-        Args:
-          key: random key.
-
-        Returns:
-          `[S]` observation, and the state.
-
-        Raises:
-          ConfigError: if JAX computes in 64 bits.
-        """
+    def observe(self, state: PyTree) -> Float[Array, " S"]:
+        """What the agent sees of a state: its features."""
+        return self.features(state).reshape(-1)
 
     @abc.abstractmethod
-    def observe(self, state: PyTree) -> Float[Array, " S"]:
-        """What the agent sees of a state."""
+    def start(self, key: Key) -> PyTree:
+        """The first state of an episode."""
+
+    @abc.abstractmethod
+    def features(self, state: PyTree) -> Float[Array, "N F"]:
+        """What an observation holds of each PoI, not yet scaled."""
 
     @abc.abstractmethod
     def action_mask(self, state: PyTree) -> Bool[Array, " A"]:
-        """`[A]` bool, the actions that exist in a state."""
+        """The actions that exist in a state."""
 
     @abc.abstractmethod
     def step(self, key: Key, state: PyTree, action: Int[Array, ""]) -> tuple[PyTree, TimeStep]:
-        """Takes an action. An episode that has ended is not restarted.
-
-        Args:
-          key: random key.
-          state: from `reset` or `step`.
-          action: `[]` int32.
-
-        Returns:
-          The next state, and what the agent sees of it.
-        """
+        """The next state, and what the agent sees of it. An episode that has ended goes on."""
 
 
 @pytree
 class OneAgent(Environment):
-    """The map MDP of one agent, whose observations are not scaled; see `Environment`.
+    """The map MDP of one agent, see `Environment`.
 
     Attributes:
-      mdp: the MDP.
       modality: index of the agent's own sensor.
     """
 
     mdp: MapMdp
     modality: int = struct.field(pytree_node=False)
 
-    @property
-    def observation_size(self) -> int:
+    def start(self, key: Key) -> MapState:
+        """The first state of an episode."""
+        return map_mdp.reset(key, self.mdp)
+
+    def features(self, state: MapState) -> Float[Array, "N F"]:
         """Mean and standard deviation of each PoI's belief."""
-        return 2 * self.mdp.num_pois * self.mdp.fusion.prior.mean.size
-
-    @property
-    def bound(self) -> float:
-        """None: infinity."""
-        return float("inf")
-
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], MapState]:
-        """Starts an episode, see `Environment.reset`."""
-        require_32_bits()
-        state = map_mdp.reset(key, self.mdp)
-        return self.observe(state), state
-
-    def observe(self, state: MapState) -> Float[Array, " S"]:
-        """The map, `[N * 2D]`, see `dqn.observation`."""
-        return observation(state.belief)
+        return of_belief(state.belief)
 
     def action_mask(self, state: MapState) -> Bool[Array, " A"]:
-        """`[A]` bool: all actions exist."""
+        """All actions exist."""
         del state
         return jnp.ones(self.num_actions, bool)
 
@@ -171,3 +139,8 @@ class OneAgent(Environment):
         after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
         seen = self.observe(after)
         return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
+
+
+def of_belief(belief: Belief) -> Float[Array, "N F"]:
+    """Mean and standard deviation of each PoI's belief."""
+    return observation(belief).reshape(len(belief.mean), -1)

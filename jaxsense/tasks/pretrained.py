@@ -1,14 +1,23 @@
-"""Trained models that travel with the package."""
+"""Files that travel with the package: trained models, and the networks and looks of tasks."""
 
 import dataclasses
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
 from jaxsense.models import Models
-from jaxsense.tasks import archive
+
+T = TypeVar("T")
+Arrays = dict[str, np.ndarray]
 
 DATA = Path(__file__).parent / "data"
 """Where the files are."""
@@ -17,6 +26,7 @@ PRETRAINED = ("default", "noisy", "many", "raw", "team")
 PREFIX = "pretrained:"
 """What stands before a preset's name where the directory of a run may stand, too."""
 
+_ABOUT = "about"
 # The others follow from the settings.
 _PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"
 
@@ -26,10 +36,6 @@ class Origin:
     """Origin of trained models: command, seed, commit and versions.
 
     Attributes:
-      command: that trained them.
-      preset: whose settings they have.
-      seed: of the training.
-      commit: of jaxsense.
       versions: of jaxsense, Python and the packages that results depend on.
     """
 
@@ -41,40 +47,55 @@ class Origin:
 
 
 def load_pretrained(preset: str) -> tuple[Config, Models]:
-    """Loads the settings and the trained models of a preset, which ship with the package.
-
-    Args:
-      preset: one of `PRETRAINED`.
-
-    Returns:
-      The settings and the models, on the default device.
-
-    Raises:
-      ConfigError: if there are no such models, or if JAX computes in 64 bits.
-    """
+    """Loads the settings and the trained models of a preset, which ship with the package."""
     require_32_bits()
-    arrays, about = archive.read(_file(preset))
-    config = from_plain(about["config"])
+    if preset not in PRETRAINED:
+        raise ConfigError("preset", preset, f"must be one of {', '.join(PRETRAINED)}")
+    arrays, config, _ = read(DATA / f"{preset}.npz")
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    parts = {name: archive.fill(arrays, name, getattr(shapes, name)) for name in _PARTS}
+    parts = {name: fill(arrays, name, getattr(shapes, name)) for name in _PARTS}
     return config, models.make_models(config, **parts)
 
 
 def write(file: Path, config: Config, trained: Models, made: Origin) -> None:
-    """Writes what `load_pretrained` reads.
-
-    Args:
-      file: a new file; its name ends in `.npz`.
-      config: settings of the training.
-      trained: the models.
-      made: what made them.
-    """
-    trees = {name: getattr(trained, name) for name in _PARTS}
-    archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
+    """Writes what `load_pretrained` reads, to a new file that ends in `.npz`."""
+    write_trees(file, {name: getattr(trained, name) for name in _PARTS}, config, made)
 
 
-def _file(preset: str) -> Path:
-    """The file of a preset's models."""
-    if preset not in PRETRAINED:
-        raise ConfigError("preset", preset, f"must be one of {', '.join(PRETRAINED)}")
-    return DATA / f"{preset}.npz"
+def write_trees(file: Path, trees: Mapping[str, PyTree], config: Config, made: Origin) -> None:
+    """Writes trees of arrays, with the settings and the origin of the models."""
+    arrays = {name: np.asarray(leaf) for name, leaf in _flat(dict(trees)).items()}
+    about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
+    text = np.array(json.dumps(about, allow_nan=False))
+    part = file.with_suffix(".part.npz")
+    np.savez_compressed(part, allow_pickle=False, **{**arrays, _ABOUT: text})
+    os.replace(part, file)
+
+
+def read(file: Path) -> tuple[Arrays, Config, Origin]:
+    """Reads what `write_trees` wrote: arrays by their places, settings and origin."""
+    with np.load(file, allow_pickle=False) as found:
+        arrays = {name: found[name] for name in found.files}
+    about = json.loads(str(arrays.pop(_ABOUT)))
+    return arrays, from_plain(about["config"]), Origin(**about["origin"])
+
+
+def fill(arrays: Arrays, name: str, shapes: T) -> T:
+    """A tree that `write_trees` was given, from the arrays that `read` returns."""
+
+    def leaf(place: str, shape: jax.ShapeDtypeStruct) -> jax.Array:
+        found = arrays.get(place)
+        if found is None or found.shape != shape.shape:
+            shown = "is missing" if found is None else f"has shape {found.shape}"
+            raise ValueError(f"{place} {shown}: must have shape {shape.shape}")
+        return jnp.asarray(found, shape.dtype)
+
+    places = _flat({name: shapes})
+    leaves = [leaf(place, shape) for place, shape in places.items()]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+def _flat(trees: Mapping[str, PyTree]) -> dict[str, PyTree]:
+    """The leaves of trees, by their places in them."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(trees)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

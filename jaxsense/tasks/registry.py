@@ -1,6 +1,7 @@
 """The frozen tasks by name, and how one is frozen."""
 
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
 import jax
@@ -9,14 +10,20 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
+from jaxsense.config import Config, ConfigError, require_32_bits
 from jaxsense.core.types import Key, Samples
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
-from jaxsense.tasks import archive
-from jaxsense.tasks.archive import Arrays
 from jaxsense.tasks.environment import Scaling
-from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin
+from jaxsense.tasks.pretrained import (
+    DATA,
+    PRETRAINED,
+    Arrays,
+    Origin,
+    fill,
+    read,
+    write_trees,
+)
 from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, fixed_draws, key_of_seed
 from jaxsense.training.comparison import models_of
 
@@ -39,44 +46,21 @@ def registered() -> tuple[str, ...]:
 
 
 def about(name: str) -> str:
-    """Describes a task in a few words.
-
-    Args:
-      name: one of `registered()`.
-
-    Raises:
-      ConfigError: if there is no such task.
-    """
+    """Describes a task in a few words."""
     _require_name(name)
     return TASKS[name]
 
 
 def origin(name: str) -> Origin:
-    """Returns the origin of a task, or of the models of `load_pretrained`.
-
-    Args:
-      name: one of `registered()` or of `PRETRAINED`.
-
-    Raises:
-      ConfigError: if there is no such task and there are no such models.
-    """
-    known = (*PRETRAINED, *TASKS)
-    if name not in known:
-        raise ConfigError("name", name, f"must be one of {', '.join(known)}")
-    _, about = archive.read(DATA / f"{name}.npz")
-    return Origin(**about["origin"])  # pyright: ignore[reportCallIssue]
+    """Returns the origin of a task, or of the models of `load_pretrained`."""
+    _require_name(name, (*PRETRAINED, *TASKS))
+    return read(DATA / f"{name}.npz")[2]
 
 
 def agents(name: str) -> tuple[str, ...]:
-    """Lists the agents of a task that `make` accepts.
-
-    Args:
-      name: one of `registered()`.
-
-    Raises:
-      ConfigError: if there is no such task.
-    """
-    return _agents(from_plain(_read(name)[1]["config"]))
+    """Lists the agents of a task that `make` accepts."""
+    _require_name(name)
+    return _agents(read(DATA / f"{name}.npz")[1])
 
 
 def make(name: str, agent: str | None = None) -> Task:
@@ -94,12 +78,12 @@ def make(name: str, agent: str | None = None) -> Task:
     Raises:
       ConfigError: if there is no such task or agent, or if JAX computes in 64 bits.
     """
-    arrays, words = _read(name)
+    _require_name(name)
     require_32_bits()
-    config = from_plain(words["config"])
+    arrays, config, _ = read(DATA / f"{name}.npz")
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    fusion = archive.fill(arrays, "fusion", shapes.fusion)
-    values = archive.fill(arrays, "look_values", shapes.look_values)
+    fusion = fill(arrays, "fusion", shapes.fusion)
+    values = fill(arrays, "look_values", shapes.look_values)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
     parts = models_of(config, fusion, values)
@@ -110,17 +94,12 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
     """A task, by its name or as it is.
 
     Args:
-      task: from `make`, or its name.
       agent: see `make`; only with a name.
-
-    Raises:
-      ConfigError: if there is no such task or agent, if `task` is something else, or if JAX
-        computes in 64 bits.
     """
     require_32_bits()
     if isinstance(task, str) and task in TASKS:
         return make(task, agent)
-    if isinstance(task, type | str) or not hasattr(task, "play"):
+    if not isinstance(task, Task):
         raise ConfigError("task", task, f"must be from make, or one of {', '.join(TASKS)}")
     if agent is not None:
         raise ConfigError("agent", agent, "must be None with a task; pass it to make(name, agent)")
@@ -128,14 +107,7 @@ def as_task(task: Task | str, agent: str | None = None) -> Task:
 
 
 def require_unchanged(task: Task) -> None:
-    """Checks that a task with the name of a frozen one has its networks, looks and rewards.
-
-    Args:
-      task: from `make`, perhaps with other fields.
-
-    Raises:
-      ConfigError: if it has been changed under its name.
-    """
+    """Checks that a task with the name of a frozen one has its networks, looks and rewards."""
     if task.name not in TASKS:
         return
     made = make(task.name, task.agent)
@@ -151,13 +123,7 @@ def freeze(
     """Writes the file of a task.
 
     Args:
-      key: random key of the states from which observations are scaled.
       file: a new file; its name ends in `.npz`.
-      name: of the task.
-      config: settings of the task.
-      trained: models with these settings.
-      looks: for each modality `[C, S, D_m]` features of held-out looks.
-      made: what made the models.
     """
     parts, bank = models_of(config, trained.fusion, trained.look_values), Bank(looks)
     unscaled = Scaling(jnp.zeros(1), jnp.ones(1))
@@ -174,21 +140,12 @@ def freeze(
         "scaling": {"offset": scaling.offset, "scale": scaling.scale},
         "returns": {agent: returns(agent) for agent in _agents(config)},
     }
-    archive.write(file, trees, {"config": as_plain(config), "origin": dataclasses.asdict(made)})
+    write_trees(file, trees, config, made)
 
 
 @fixed_draws()
 def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
-    """Mean returns of the policies to compare with.
-
-    Args:
-      task: the task.
-      seeds: number of seeds.
-      episodes: with each seed.
-
-    Returns:
-      By name, `[seeds]`.
-    """
+    """Mean returns of the policies to compare with."""
 
     def mean(name: str) -> np.ndarray:
         @jax.jit
@@ -201,16 +158,10 @@ def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.nda
     return {name: mean(name) for name in task.references}
 
 
-def _read(name: str) -> tuple[Arrays, dict[str, object]]:
-    """What a task's file holds, see `archive.read`."""
-    _require_name(name)
-    return archive.read(DATA / f"{name}.npz")
-
-
-def _require_name(name: str) -> None:
+def _require_name(name: str, known: Iterable[str] = TASKS) -> None:
     """Raises `ConfigError` if there is no such task."""
-    if name not in tuple(TASKS):  # a list has no hash
-        raise ConfigError("name", name, f"must be one of {', '.join(TASKS)}")
+    if name not in tuple(known):  # a list has no hash
+        raise ConfigError("name", name, f"must be one of {', '.join(known)}")
 
 
 def _agents(config: Config) -> tuple[str, ...]:

@@ -15,7 +15,9 @@ from scipy import stats
 from jaxsense.config import ConfigError
 from jaxsense.config.section import require_function
 from jaxsense.core import checks
+from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
+from jaxsense.dqn.policies import Agent, best
 from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, fixed_draws, key_of_seed
 
@@ -57,7 +59,6 @@ class Estimate:
       value: interquartile mean over seeds (Agarwal et al. 2021, Deep RL at the edge of the
         statistical precipice, Sec. 4).
       low: lower end of the 95 % interval, by a bootstrap over seeds.
-      high: upper end.
     """
 
     value: float
@@ -73,8 +74,6 @@ class Score:
     """Result of `score`: returns of a policy, and of known policies to compare it with.
 
     Attributes:
-      task: name of the task.
-      agent: who acts.
       returns: `[seeds]` mean return of an episode, without discount, with each seed.
       references: by name, `[seeds]` the same of known policies from the same starts.
       has_optimum: whether the first of them is optimal.
@@ -132,13 +131,11 @@ def score(
     """Evaluates a policy in a task, next to the optimum and other known policies.
 
     Args:
-      task: from `make`, or its name.
       policy: the policy; or several, one for each seed that they were trained with, so that the
         interval covers the spread of trainings. One policy plays with `SEEDS` seeds, and its
         interval covers the spread of starts and looks alone. Policies that are pytrees of numbers,
         such as a `jax.tree_util.Partial` of parameters, are compiled once for all.
       agent: see `make`; only with a name.
-      episodes: with each seed.
 
     Returns:
       The score. Its starts and looks are always the same, whatever JAX's settings of random
@@ -177,10 +174,6 @@ def score(
 def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
     """Wraps a policy that JAX cannot trace, for example one in NumPy or PyTorch.
 
-    Args:
-      act: `[B, S]` float32 observations to `[B]` integer actions, for any B. It is called with
-        two observations of zeros before it plays.
-
     Raises:
       ConfigError: if `act` is not such a function. The policy raises it if `act` returns an array
         of another shape or dtype.
@@ -212,12 +205,21 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
     return policy
 
 
-def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
-    """Computes the interquartile mean over seeds, with a bootstrap interval.
+@checks.typed
+def greedy(task: Task, agent: Agent, params: Params) -> Policy:
+    """Makes a policy for `score` that takes the action with the highest Q-value."""
+    return Partial(_act, task, agent, params)
 
-    Args:
-      values: `[seeds]`.
-    """
+
+def _act(
+    task: Task, agent: Agent, params: Params, key: Key, observation: Float[Array, " S"]
+) -> Int[jax.Array, ""]:
+    del key
+    return best(agent.values(params, task.inputs(observation)))
+
+
+def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:
+    """Computes the interquartile mean over seeds, with a bootstrap interval."""
     checks.require_shape("values", values, (None,))
 
     def middle(values: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -238,13 +240,7 @@ def mean_return(key: Key, task: Task | str, policy: Policy | Recurrent, episodes
     Starts and looks differ from those of a score.
 
     Args:
-      key: random key; none is that of a score.
-      task: from `make`, or its name.
       policy: see `score`; compiled anew in each call, unless it is a pytree of numbers.
-      episodes: number of episodes.
-
-    Returns:
-      Mean return of an episode, without discount.
 
     Raises:
       ConfigError: if the policy is not such a function, returns values of another shape or dtype,

@@ -14,18 +14,15 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.config import require_32_bits
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import environments, episodes, map_agent, policies, team_mdp
-from jaxsense.dqn.environments import Agent
+from jaxsense.core.types import Key, pytree
+from jaxsense.dqn import episodes, policies, team_mdp
 from jaxsense.dqn.episodes import Start
-from jaxsense.dqn.map_mdp import MapState
-from jaxsense.dqn.policies import Known
-from jaxsense.dqn.reference import reference
+from jaxsense.dqn.policies import Agent, Known
+from jaxsense.dqn.team_agent import TeamEnvironment
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.models import Models
-from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
+from jaxsense.tasks.environment import CLIP, Environment, OneAgent, Scaling, TimeStep, of_belief
 
 M = TypeVar("M")
 
@@ -48,12 +45,9 @@ class Task(Environment):
     Attributes:
       models: frozen networks, of which only those that the references read are there, and the agent
         that learns in the preset of the task.
-      scaling: of observations.
       returns: `[R, seeds]` mean return of each reference with each seed of a score, see
         `registry.reference_returns`.
-      name: with its version.
       agent: who acts: the name of a sensor, or `team` for all robots.
-      modalities: names of all sensors.
       references: names of the policies that `play_reference` plays, to compare with.
       has_optimum: whether the first one is optimal.
     """
@@ -66,93 +60,51 @@ class Task(Environment):
     modalities: tuple[str, ...] = struct.field(pytree_node=False)
     references: ClassVar[tuple[str, ...]]
     has_optimum: ClassVar[bool]
+    bound = CLIP
 
     def __repr__(self) -> str:
         """How to make the task; its numbers would fill pages."""
         return f"jaxsense.make({self.name!r}, {self.agent!r})"
-
-    @property
-    def observation_size(self) -> int:
-        """The features of all PoIs."""
-        return self.scaling.offset.size * self.mdp.map.num_pois
-
-    @property
-    def bound(self) -> float:
-        """Observations are clipped there."""
-        return self.scaling.bound
 
     def observe(self, state: PyTree) -> Float[Array, " S"]:
         """What the agent sees of a state: its features, scaled."""
         return self.scaling(self.features(state))
 
     @abc.abstractmethod
-    def features(self, state: PyTree) -> Float[Array, "N F"]:
-        """`[N, F]` what an observation holds of each PoI, not yet scaled."""
-
-    @abc.abstractmethod
-    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
-        """What `dqn.train` learns in.
-
-        Args:
-          agent: the learner, as `models.agent` or with other settings.
-        """
+    def learning(self, agent: Agent) -> PyTree:
+        """What `dqn.train` learns in with `models.agent`, perhaps with other settings."""
 
     @abc.abstractmethod
     def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
-        """What an agent's Q-network reads, from an observation.
-
-        Args:
-          observation: `[S]` scaled, of the task.
-        """
+        """What an agent's Q-network reads, from an observation of the task."""
 
     @abc.abstractmethod
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
-        """Plays an episode with a policy.
+        """Total reward of an episode with a policy, without discount.
 
         Args:
           key: random key; with the same one all policies start from the same state.
           act: the policy.
           memory: before the first action.
-
-        Returns:
-          `[]` total reward, without discount.
         """
 
     @abc.abstractmethod
     def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
-        """Plays an episode with a policy to compare with.
-
-        Args:
-          key: random key, see `play`.
-          name: one of `references`; static.
-        """
+        """The same with one of `references`; `name` is static."""
 
 
 @pytree
-class MapTask(OneAgent, Task):
+class MapTask(Task, OneAgent):
     """A task in the map MDP: one agent looks at PoIs until it has seen enough.
 
-    Dynamic programming finds the optimum, see `dqn.reference`.
+    Dynamic programming finds the optimum, see `dqn.episodes.reference`.
     """
 
     references = ("optimal", "greedy", "naive", "random")
     has_optimum = True
     __repr__ = Task.__repr__
 
-    @property
-    def bound(self) -> float:
-        """Observations are clipped there."""
-        return self.scaling.bound
-
-    def observe(self, state: MapState) -> Float[Array, " S"]:
-        """What the agent sees: the map, scaled."""
-        return Task.observe(self, state)
-
-    def features(self, state: MapState) -> Float[Array, "N F"]:
-        """`[N, 2D]` mean and standard deviation of each PoI's belief, not yet scaled."""
-        return _of_belief(state.belief)
-
-    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
+    def learning(self, agent: Agent) -> PyTree:
         """The map MDP, see `Task.learning`."""
         return agent.environment(self.mdp, self.modality)
 
@@ -164,7 +116,7 @@ class MapTask(OneAgent, Task):
         """Plays an episode, see `Task.play`; the k-th look at a PoI shows the same to all."""
 
         def choose(key: Key, known: Known, memory: M) -> tuple[jax.Array, M]:
-            return act(key, memory, self.scaling(_of_belief(known.belief)))
+            return act(key, memory, self.scaling(of_belief(known.belief)))
 
         exact, (start, key) = self.models.bayes, self._start(key)
         return episodes.run_recurrent(key, self.mdp, exact, choose, memory, start, self.modality)[0]
@@ -174,7 +126,7 @@ class MapTask(OneAgent, Task):
         exact, (start, key) = self.models.bayes, self._start(key)
         # The same in every episode, so that it is simulated once.
         table_key = _key(0)
-        best = reference(table_key, self.mdp, self.modality, self.models, exact.labels)
+        best = episodes.reference(table_key, self.mdp, self.modality, self.models, exact.labels)
 
         def choose(key: Key, known: Known) -> jax.Array:
             if name == self.references[0]:
@@ -206,13 +158,17 @@ class TeamTask(Task):
     has_optimum = False
     __repr__ = Task.__repr__
 
+    def start(self, key: Key) -> TeamState:
+        """The first state of an episode."""
+        return team_mdp.reset(key, self.mdp, self.robots)
+
     def features(self, state: TeamState) -> Float[Array, "N F"]:
-        """`[N, F]` what the robot knows whose turn it is, not yet scaled."""
+        """What the robot knows whose turn it is, not yet scaled."""
         return self.mdp.observe(state, state.agent).T
 
-    def learning(self, agent: Agent) -> environments.Environment[PyTree]:
+    def learning(self, agent: Agent) -> PyTree:
         """The team MDP with the robots of the task, see `Task.learning`."""
-        return environments.TeamEnvironment(agent, self.mdp, self.robots)
+        return TeamEnvironment(agent, self.mdp, self.robots)
 
     def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
         """What the robot knows whose turn it is, see `Task.inputs`."""
@@ -220,14 +176,8 @@ class TeamTask(Task):
         # Networks ask whether a PoI's presence is above 0, which rounding must not decide.
         return features.at[-3].set(jnp.round(features[-3])).reshape(-1)
 
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], TeamState]:
-        """Starts an episode, see `Task.reset`."""
-        require_32_bits()
-        state = team_mdp.reset(key, self.mdp, self.robots)
-        return self.observe(state), state
-
     def action_mask(self, state: TeamState) -> Bool[Array, " A"]:
-        """`[A]` bool: the PoIs that are present, and NOP."""
+        """The PoIs that are present, and NOP."""
         return team_mdp.action_mask(state)
 
     def step(
@@ -257,9 +207,7 @@ class TeamTask(Task):
     def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """Plays an episode with one of `references`, see `Task.play_reference`."""
 
-        def choose(
-            key: Key, state: TeamState, known: Known, memory: tuple[()]
-        ) -> tuple[jax.Array, tuple[()]]:
+        def choose(key: Key, state: TeamState, known: Known, memory: M) -> tuple[jax.Array, M]:
             values = policies.POLICIES[name].values(key, self.models, known)
             values = jnp.where(self.action_mask(state), values, -jnp.inf)
             return policies.best(values), memory
@@ -267,10 +215,9 @@ class TeamTask(Task):
         return self._play(key, choose, ())
 
     def _play(self, key: Key, choose: Callable[..., tuple[jax.Array, M]], memory: M) -> jax.Array:
-        """`[]` total reward."""
+        """Total reward of an episode."""
         start_key, play_key = jax.random.split(key)
-        start = team_mdp.reset(start_key, self.mdp, self.robots)
-        return episodes.run_team(play_key, self.mdp, choose, memory, start)[0]
+        return episodes.run_team(play_key, self.mdp, choose, memory, self.start(start_key))
 
 
 @contextlib.contextmanager
@@ -288,8 +235,3 @@ def key_of_seed(seed: int) -> Key:
 def _key(seed: int) -> Key:
     """`jax.random.key` of a 32-bit seed, whatever JAX's settings are."""
     return jax.random.wrap_key_data(jnp.array([0, seed], jnp.uint32), impl=_IMPLEMENTATION)
-
-
-def _of_belief(belief: Belief) -> Float[Array, "N F"]:
-    """`[N, 2D]` mean and standard deviation of each PoI's belief."""
-    return map_agent.observation(belief).reshape(len(belief.mean), -1)

@@ -14,15 +14,15 @@ from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn import map_mdp, optimum, rewards, rules, team_mdp, tours
+from jaxsense.dqn import map_mdp, optimum, rewards, team_mdp, tours
 from jaxsense.dqn import training as dqn
-from jaxsense.dqn.environments import Environment
 from jaxsense.dqn.map_mdp import MapMdp, MapState
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import expected_gain
+from jaxsense.dqn.policies import auction, expected_gain
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.dqn.tours import Trials
+from jaxsense.dqn.training import Environment
 from jaxsense.looks import Bank, Live
 from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.arena import Arena
@@ -250,4 +250,4 @@ class _Auction:
         """`[N + 1]` values of actions."""
         times = team_mdp.travel_times(self.mdp.travel, state.team)
         worth = read.T[state.team.modality] - self.mdp.config.second_cost * times
-        return rules.auction(worth, times, state.team, state.agent)
+        return auction(worth, times, state.team, state.agent)

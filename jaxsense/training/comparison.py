@@ -13,10 +13,10 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn import episodes, policies
+from jaxsense.dqn.episodes import reference
 from jaxsense.dqn.map_mdp import Looks, MapMdp, random_start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Policy, Values
-from jaxsense.dqn.reference import reference
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models, make_agent, make_bayes, make_models
@@ -26,7 +26,7 @@ from jaxsense.vae import novelty
 
 COMPARED = ("latent", "optimal", "greedy", "naive", "random")
 """Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`; `optimal` is the
-reference of the MDP, see `dqn.reference`."""
+reference of the MDP, see `dqn.episodes`."""
 
 Rewards = dict[str, tuple[Float[Array, " S"], Float[Array, " S"]]]
 """By policy, `[S]` total reward and `[S]` reward of the first action from each start, averaged over

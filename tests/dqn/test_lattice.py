@@ -53,11 +53,3 @@ def test_a_linear_function_is_read_exactly_between_the_points(number):
     for weights in (inside, edges, np.eye(number)):
         found = interpolate(table, jnp.array(weights, jnp.float32))
         np.testing.assert_allclose(found, weights @ slopes, atol=1e-5)
-
-
-def test_sizes_that_no_lattice_has_are_named():
-    for number in (0, -1, 1.5):
-        with pytest.raises(ValueError, match=r"num_classes = .*: must be a whole number"):
-            optimum.steps_of_lattice(number)
-    with pytest.raises(ValueError, match="probabilities"):
-        optimum.interpolate(jnp.zeros(513), jnp.full((1, 2), 0.5))

@@ -14,8 +14,7 @@ from toys import known_of, policy
 
 from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import episodes, optimum, rewards
-from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.rewards import Reward
 
@@ -205,155 +204,6 @@ def test_values_on_labels_are_those_of_all_histories_of_classes(world):
     assert total[0] > alone[0] + 0.05
 
 
-@pytest.mark.parametrize("world", GRIDS)
-def test_greedy_choice_is_nearly_the_optimum(world):
-    for weights in starts_of(world):
-        best = over_classes(world, weights, 4)
-        greedy = over_classes(world, weights, 4, is_greedy=True)
-        # It stops where one look alone would not pay but two would.
-        assert -1e-9 <= best - greedy < 0.01
-
-
-def test_an_episode_of_few_steps_has_as_few_looks():
-    _, information, config = REWARDS["nats"]
-    reward = Of(information, rewards.make(config))
-    likelihoods = jnp.log(jnp.array(LOOKS[3]))
-    shorter = replace(config, max_steps=2)
-    found = solve(likelihoods, reward, shorter, HORIZON)
-    for horizon, is_same in ((2, True), (HORIZON, False)):
-        other = solve(likelihoods, reward, config, horizon)
-        assert np.allclose(found.q, other.q, atol=1e-6) == is_same
-        assert np.allclose(found.q_unseen, other.q_unseen, atol=1e-6) == is_same
-
-
-def test_a_look_that_is_certain_pays_once():
-    # It shows the class: ln 2 from one half each, and then no more than it costs.
-    likelihoods = jnp.array([[[0.0, -200.0]], [[-200.0, 0.0]]])
-    config = MdpConfig(reward="nats", look_cost=0.1)
-    found = solve(likelihoods, rewards.make(config), config, 5)
-    weights = jnp.array([[0.5, 0.5], [1.0, 0.0], [0.0, 1.0]])
-    for table in (found.one_step, found.q):
-        # In none of the last two can the look of the other class happen.
-        np.testing.assert_allclose(
-            interpolate(table, weights), [math.log(2) - 0.1, -0.1, -0.1], atol=1e-6
-        )
-
-
-# A look is red with the chance .75, .5 or .25: three, two or one of four looks.
-OF_RED, OF_GREEN = (0.75, 0.5, 0.25), (0.25, 0.5, 0.75)
-CALIBRATED = jnp.log(
-    jnp.array(
-        [
-            [OF_RED, OF_RED, OF_RED, OF_GREEN],
-            [OF_RED, OF_RED, OF_GREEN, OF_GREEN],
-            [OF_RED, OF_GREEN, OF_GREEN, OF_GREEN],
-        ]
-    )
-)
-
-
-@pytree
-class Calibrated:
-    """A look shows how likely each class makes one of four that its class is equally likely to be.
-
-    A scene is the PoIs' classes.
-    """
-
-    num_modalities = 1
-
-    def scene(self, key, classes):
-        return classes
-
-    def observe(self, key, scene, poi, modality):
-        return CALIBRATED[scene[poi], jax.random.randint(key, (), 0, 4)], scene
-
-
-@pytree
-class Exact:
-    """Beliefs whose means are the classes' logarithmic probabilities by exact Bayes.
-
-    A belief after a look has a standard deviation of 1.
-    """
-
-    prior = PRIOR
-    classes = Belief(jnp.zeros((3, 3)), jnp.ones((3, 3)))
-
-    def update(self, belief, seen, features, modality):
-        return Belief(belief.mean + features, jnp.ones(3))
-
-    def class_probabilities(self, belief):
-        return jax.nn.softmax(belief.mean)
-
-
-class Told:
-    """Exact Bayes."""
-
-    def log_likelihoods(self, features, modality):
-        return features
-
-
-@pytest.fixture(scope="module")
-def played():
-    """Values of two unseen PoIs by the tables, and returns of the policies that read them.
-
-    The information is the negative entropy, or a convex function of the likeliest class.
-    """
-
-    @jax.jit
-    def play(keys, is_convex, cost, unseen):
-        def information(weights):
-            return jnp.where(is_convex, jnp.max(weights) ** 8, -rewards.entropy(weights))
-
-        config = MdpConfig(reward="nats", look_cost=cost, max_steps=200, partly_seen_starts=False)
-        reward = Of(information, rewards.make(config), unseen)
-        mdp = MapMdp(Calibrated(), Exact(), reward, config, 2)
-        found = optimum.value_iteration(CALIBRATED, reward, certain, PRIOR, config, 100)
-        models = {"look_values": (found,), "fusion": Exact()}
-
-        def returns(key):
-            start_key, play_key = jax.random.split(key)
-            start = episodes.reset(start_key, mdp, Told(), seen=jnp.zeros((2, 1), bool))
-            return [
-                episodes.run_episode(play_key, mdp, Told(), policy(name, **models), start, 0)[0]
-                for name in ("optimal", "bayes", "greedy")
-            ]
-
-        return (found.q_unseen, found.one_step_unseen), jax.vmap(returns)(keys)
-
-    return play
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("is_convex", "cost", "unseen"),
-    [
-        (False, 0.03, -math.log(3)),
-        # One look alone does not pay, several do.
-        (True, 0.02, 3.0**-8),
-        # An unseen PoI is less well known than one whose looks left all classes open: it pays .5
-        # more to look there first.
-        (False, 0.03, -math.log(3) - 0.5),
-    ],
-    ids=["entropy", "convex", "unseen"],
-)
-def test_the_policy_by_the_table_returns_the_tables_value(played, is_convex, cost, unseen):
-    number = 4000
-    (total, gain), (optimal, short_sighted, on_map) = played(
-        jax.random.split(KEY, number), is_convex, cost, unseen
-    )
-    # This map holds the exact posterior.
-    np.testing.assert_allclose(on_map, short_sighted, atol=1e-4)
-    # Four standard errors of the mean; each of the two PoIs is worth the table's value.
-    error = 4 * optimal.std() / np.sqrt(number)
-    np.testing.assert_allclose(optimal.mean(), 2 * total, atol=error)
-    difference = optimal - short_sighted
-    assert difference.mean() > -4 * difference.std() / np.sqrt(number)
-    if is_convex:
-        assert gain < 0 < total
-        np.testing.assert_array_equal(short_sighted, 0.0)
-        assert difference.mean() > 4 * difference.std() / np.sqrt(number)
-
-
 def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
     table = jnp.array(optimum.lattice(3)[:, 0]) - 0.5
     values = LookValues(table, table, jnp.float32(0.15), jnp.float32(0.15))
@@ -365,31 +215,6 @@ def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
     for known, action in (((0.6, 0.2, 0.2), 1), ((0.7, 0.15, 0.15), 0)):
         posterior = np.log([known, (1 / 3, 1 / 3, 1 / 3)])
         assert act(KEY, known_of(posterior, [[1], [0]])) == action
-
-
-LIKELIHOODS = np.zeros((3, 2, 3), np.float32)
-ONE_NAN = np.where(np.arange(18).reshape(3, 2, 3) == 8, np.float32(np.nan), LIKELIHOODS)
-
-
-def solve_now(likelihoods, horizon):
-    config = MdpConfig()
-    reward = rewards.make(config)
-    return optimum.value_iteration(likelihoods, reward, certain, PRIOR, config, horizon)
-
-
-@pytest.mark.parametrize(
-    ("likelihoods", "horizon", "error", "expected"),
-    [
-        (LIKELIHOODS[..., :2], 2, ValueError, "likelihoods"),
-        (ONE_NAN, 2, ValueError, "likelihoods = nan: must be finite"),
-        (np.full_like(LIKELIHOODS, -np.inf), 2, ValueError, "likelihoods = -inf: must be finite"),
-        (LIKELIHOODS, 0, ValueError, "horizon = 0: must be a whole number greater than 0"),
-        (LIKELIHOODS, 1.5, ValueError, "horizon = 1.5: must be a whole number"),
-    ],
-)
-def test_what_has_no_values_is_named(likelihoods, horizon, error, expected):
-    with pytest.raises(error, match=expected):
-        solve_now(likelihoods, horizon)
 
 
 @pytest.mark.parametrize("horizon", [1, 8])

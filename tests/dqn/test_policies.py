@@ -11,6 +11,7 @@ from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import map_agent, optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Policy
+from jaxsense.dqn.team_mdp import Team
 
 NOP, KEY, UNKNOWN = 3, jax.random.key(0), np.zeros((3, 3))
 # The logarithm of what is not so.
@@ -39,23 +40,6 @@ def worthless():
 def look_values(q, one_step=None):
     (one, one_unseen), (total, unseen) = one_step or worthless(), q
     return LookValues(one, total, one_unseen, unseen)
-
-
-@pytest.mark.parametrize(
-    ("seen_by_camera", "expected"),
-    [((0, 0, 0), 0), ((1, 0, 0), 1), ((0, 1, 1), 0), ((1, 1, 0), 2), ((1, 1, 1), NOP)],
-)
-def test_naive_looks_at_the_first_poi_the_own_sensor_has_not_seen(seen_by_camera, expected):
-    looks = np.array([seen_by_camera, (1, 0, 1)]).T  # what the LiDAR has seen does not matter
-    assert policy("naive")(KEY, known_of(UNKNOWN, looks, 0)) == expected
-    assert policy("naive")(KEY, known_of(UNKNOWN, looks[:, ::-1], 1)) == expected
-
-
-def test_naive_play_of_more_looks_counts_its_own():
-    looks = np.array([(1, 3), (2, 0), (3, 0)])
-    found = [policy(f"naive{n}")(KEY, known_of(UNKNOWN, looks, 0)) for n in ("", "_2", "_3")]
-    assert [int(action) for action in found] == [NOP, 0, 0]
-    assert policy("naive_3")(KEY, known_of(UNKNOWN, looks[1:], 0)) == 0
 
 
 @pytest.mark.parametrize(
@@ -96,15 +80,6 @@ def test_greedy_reads_the_map_where_bayes_reads_the_exact_posterior():
     # The other sensor has other values.
     known = known_of([EDGY, ROUND, ROUND], np.ones((3, 2)), 1, on_map)
     assert policy("greedy", **models)(KEY, known) == NOP
-
-
-def test_expected_gains_are_of_each_sensor_and_poi():
-    camera = look_values(worthless(), linear((1.0, -2.0, 4.0), 7.0))
-    lidar = look_values(worthless(), linear((0.0, 3.0, 0.0), -5.0))
-    on_map = Belief(jnp.array([[0.5, 0.5, 0], [0, 0, 1.0], [0, 1.0, 0]]), jnp.ones((3, 3)))
-    is_seen = jnp.array([True, True, False])
-    found = policies.expected_gains(OnMap(), (camera, lidar), on_map, is_seen)
-    np.testing.assert_allclose(found, [[-0.5, 4, 7], [1.5, 0, -5]], atol=1e-5)
 
 
 def test_random_takes_every_action_equally_often():
@@ -169,3 +144,114 @@ def test_a_policy_of_ones_own_is_one_more_entry():
     assert table["timed"] is timed
     with pytest.raises(ConfigError, match=r"^policies = 'greedy': must not be latent, "):
         policies.table({"greedy": backwards})
+
+
+RULES = (policies.nearest, policies.auction, policies.gain_rate)
+
+
+def team(num_robots, num_pois=3, target=None, works=None, present=None):
+    """The places are of no importance to the policies."""
+    return Team(
+        positions=jnp.zeros((num_pois, 2)),
+        present=jnp.ones(num_pois, bool) if present is None else jnp.array(present, bool),
+        poses=jnp.zeros((num_robots, 3)),
+        modality=jnp.zeros(num_robots, int),
+        works=jnp.ones(num_robots, bool) if works is None else jnp.array(works, bool),
+        target=jnp.array([num_pois] * num_robots if target is None else target),
+    )
+
+
+def choice(rule, gains, times, agent=0, **of_team):
+    """The action of the highest value."""
+    gains, times = jnp.array(gains, jnp.float32), jnp.array(times, jnp.float32)
+    values = jax.jit(rule)(gains, times, team(*gains.shape, **of_team), jnp.int32(agent))
+    assert values.shape == (gains.shape[1] + 1,)
+    assert values[-1] == 0
+    return int(jnp.argmax(values))
+
+
+ALIKE = np.ones((2, 3))
+
+
+@pytest.mark.parametrize(
+    ("times", "gains", "target", "expected"),
+    [
+        ([5, 3, 9], [1, 1, 1], 3, 1),
+        ([5, 3, 9], [1, 0, 1], 3, 0),  # of PoI 1 nothing is to be learned
+        ([5, 3, 9], [0.01, -1, 5], 3, 0),  # how much counts for nothing
+        ([5, 3, 9], [1, 1, 1], 1, 0),  # the other robot heads for PoI 1
+        ([5, 3, 9], [-1, 1, 0], 1, 1),  # but nothing else is left
+        ([90, 3, 99], [1, 1, 1], 1, 0),  # 90 s are less than the 3 + 100 of what is taken
+        ([5, 3, 9], [0, -1, -2], 3, 3),  # nothing useful: NOP
+        ([5000, 3000, 9000], [1, 1, 1], 3, 1),  # however far
+    ],
+)
+def test_nearest(times, gains, target, expected):
+    found = choice(policies.nearest, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
+    assert found == expected
+
+
+@pytest.mark.parametrize(
+    ("times", "gains", "target", "expected"),
+    [
+        ([4, 2, 8], [0.8, 0.3, 0.8], 3, 0),  # .2, .15 and .1 in a second
+        ([4, 1, 8], [0.8, 0.3, 0.8], 3, 1),  # .2, .3 and .1
+        ([4, 2, 8], [0.8, 0.3, 0.8], 0, 1),  # PoI 0 is taken: .8 / 104
+        ([4, 2, 8], [0.8, -0.3, 0.0], 0, 0),  # but nothing else is left
+        ([4, 2, 8], [-0.8, 0.0, -0.8], 3, 3),
+    ],
+)
+def test_gain_rate(times, gains, target, expected):
+    found = choice(policies.gain_rate, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
+    assert found == expected
+
+
+def test_values_of_rules_as_worked_by_hand():
+    gains, times = jnp.array([[0.8, 0.3, -1.0]]), jnp.array([[4.0, 2.0, 1.0]])
+    one = team(1)
+    found = policies.nearest(gains, times, one, jnp.int32(0))
+    # 1 / (1 + seconds)
+    np.testing.assert_allclose(found, [1 / 5, 1 / 3, -1, 0], rtol=1e-6)
+    found = policies.gain_rate(gains, times, one, jnp.int32(0))
+    np.testing.assert_allclose(found, [0.2, 0.15, -1, 0], rtol=1e-6)
+    # The auction's PoI is worth 1 more than in `nearest`.
+    found = policies.auction(gains, times, one, jnp.int32(0))
+    np.testing.assert_allclose(found, [1 / 5, 4 / 3, -1, 0], rtol=1e-6)
+
+
+def test_auctions_as_worked_by_hand():
+    # 1 s: robot 1 wins PoI 0, and robot 0 is left with PoI 1 for 4 s, though PoI 0 is nearer.
+    times = [[2, 4, 9], [1, 5, 9]]
+    assert [choice(policies.auction, ALIKE, times, agent=i) for i in range(2)] == [1, 0]
+    assert choice(policies.nearest, ALIKE, times) == 0
+    # 2 s: robot 1 wins PoI 0. Of the rest 3.5 s: robot 2 wins PoI 1. Then robot 0 PoI 2 for 5 s.
+    times, ones = [[3, 4, 5], [2, 6, 7], [2.5, 3.5, 8]], np.ones((3, 3))
+    assert [choice(policies.auction, ones, times, agent=i) for i in range(3)] == [2, 0, 1]
+    times = [[3, 4], [2, 6], [1, 5]]
+    ones = np.ones((3, 2))
+    # Robot 2 wins PoI 0, robot 0 PoI 1, and robot 1 nothing: it goes to the nearest.
+    assert [choice(policies.auction, ones, times, agent=i) for i in range(3)] == [1, 0, 0]
+    # Where the winner of PoI 0 already heads for it, there is another one to go to.
+    assert choice(policies.auction, ones, times, agent=1, target=[2, 2, 0]) == 1
+
+
+def test_who_has_nothing_to_learn_or_has_ended_does_not_bid():
+    times = [[2, 4, 9], [1, 5, 9]]
+    assert choice(policies.auction, [[1, 1, 1], [0, 1, 1]], times) == 0
+    assert choice(policies.auction, ALIKE, times, works=[True, False]) == 0
+
+
+def test_what_a_robot_that_has_ended_headed_for_is_free():
+    for rule in (policies.nearest, policies.gain_rate):
+        times = [[2, 4, 9], [1, 1, 1]]
+        assert choice(rule, ALIKE, times, target=[3, 0]) == 1
+        assert choice(rule, ALIKE, times, target=[3, 0], works=[True, False]) == 0
+        # The robot's own target is taken by nobody.
+        assert choice(rule, ALIKE, times, target=[0, 3]) == 0
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_absent_pois_are_left_out(rule):
+    times = [[2, 4, 9], [8, 8, 8]]
+    assert choice(rule, ALIKE, times, present=[0, 1, 1]) == 1
+    assert choice(rule, ALIKE, times, present=[0, 0, 0]) == 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toys import classes_mdp, noisy_mdp
 
-from jaxsense.dqn import policies, reference
+from jaxsense.dqn import episodes, policies
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 # The camera tells class 0 from the others, the LiDAR class 2.
@@ -18,58 +18,20 @@ LABELS = jnp.array([[1, 0, 0], [0, 0, 1]])
 @pytest.fixture(scope="module")
 def rewards():
     """Of the LiDAR's looks."""
-    return jax.jit(lambda: reference.expected_rewards(KEY, MDP, 1, num_draws=2))()
+    return jax.jit(lambda: episodes.expected_rewards(KEY, MDP, 1, num_draws=2))()
 
 
 def chosen(rewards, seen, classes=(0, 1, 2), labels=LABELS):
     seen, classes = jnp.array(seen, bool), jnp.array(classes)
-    return policies.best(reference._informed(rewards, labels, seen, classes))
-
-
-@pytest.mark.parametrize(
-    ("seen", "expected"),
-    [
-        (((1, 1), (1, 0), (1, 1)), 1),  # only PoI 1 is left for the LiDAR
-        (((1, 1), (0, 1), (0, 1)), NOP),  # the LiDAR has seen all
-        (((0, 0), (0, 1), (1, 0)), 2),  # 1 - .2 = .8 pays more than .2 - .158
-        (((0, 0), (0, 1), (0, 1)), 0),
-    ],
-)
-def test_the_look_that_pays_most_is_taken_or_else_nop(rewards, seen, expected):
-    assert chosen(rewards, seen) == expected
-
-
-def test_expected_rewards_of_each_look(rewards):
-    # Nobody, camera, LiDAR, both: .2 - 1 / sqrt(40) = .041886; 1 - .2 = .8; twice in vain.
-    table = np.repeat([[0.041886], [0.8], [-1.0], [-1.0]], 3, axis=1)
-    np.testing.assert_allclose(rewards, table, rtol=1e-4)
+    return policies.best(episodes._informed(rewards, labels, seen, classes))
 
 
 def test_expected_rewards_average_over_the_draws():
     mdp = noisy_mdp()  # every look gains a uniform number of its own
-    rewards = jax.jit(lambda: reference.expected_rewards(KEY, mdp, 0, num_draws=400))()
+    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp, 0, num_draws=400))()
     # 1/2 +- 4 sqrt(1/12 / 400) = +- .058, by different draws for each number.
     np.testing.assert_allclose(rewards, 0.5, atol=0.058)
     assert len(np.unique(rewards)) == 12
-
-
-@pytest.mark.parametrize("num_draws", [256, 300])
-def test_expected_rewards_in_parts_are_those_of_all_looks_at_once(num_draws, monkeypatch):
-    mdp = noisy_mdp()  # every look gains a uniform number of its own
-    sizes = []
-
-    def at_once(function, looks, batch_size):
-        sizes.append((len(looks[0]), batch_size))
-        return jax.vmap(function)(looks)
-
-    def rewards():
-        return jax.jit(lambda: reference.expected_rewards(KEY, mdp, 0, num_draws=num_draws))()
-
-    in_parts = rewards()
-    monkeypatch.setattr(jax.lax, "map", at_once)
-    np.testing.assert_array_equal(in_parts, rewards())
-    # Looks by two modalities at three classes: 3 parts of 1,024, or these and a rest of 528.
-    assert sizes == [(4 * 3 * num_draws, 1024)]
 
 
 @pytest.mark.parametrize(
@@ -90,7 +52,7 @@ def test_rewards_are_averaged_over_the_classes_that_looks_leave_open(rewards_of_
 
 def test_rewards_of_one_poi_and_three_modalities():
     mdp = classes_mdp(num_pois=1, num_modalities=3)
-    rewards = jax.jit(lambda: reference.expected_rewards(KEY, mdp, 1, num_draws=2))()
+    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp, 1, num_draws=2))()
     # By who has looked, first modality in the lowest bit: nobody .2 - .158114, one other 1 - .2,
     # both others 2 - 1, and in vain where the own bit is set.
     of_codes = [0.041886, 0.8, -1.0, -1.0, 0.8, 1.0, -1.0, -1.0]
@@ -114,4 +76,4 @@ def test_where_an_optimum_can_be_had(accumulates, number, of_labels, is_sound, e
     fusion = SimpleNamespace(accumulates=accumulates, classes=SimpleNamespace(mean=range(number)))
     labels = np.zeros((2, 2)) if of_labels else None
     values = SimpleNamespace(labels=labels, q=range(2048))
-    assert reference.has_optimum(fusion, values, is_sound) is expected  # pyright: ignore
+    assert episodes.has_optimum(fusion, values, is_sound) is expected  # pyright: ignore

@@ -12,16 +12,13 @@ from toys import (
     PLACES,
     Fixed,
     classes_mdp,
-    known_of,
     paying_once_mdp,
-    policy,
     team_mdp_of,
 )
 
-from jaxsense.config import PRESETS, DqnConfig, TeamConfig
-from jaxsense.dqn import losses, map_mdp, team_mdp, training
+from jaxsense.config import DqnConfig, TeamConfig
+from jaxsense.dqn import map_mdp, team_mdp, training
 from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.models import make_agent
 
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 SMALL = DqnConfig(
@@ -66,53 +63,11 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
 AGENT = learning_in(TWO).agent
 
 
-def team_params():
-    params = AGENT.init(jax.random.key(1))
-    # So that some look is worth more than NOP.
-    params["params"]["Value"]["bias"] += 9.0
-    return params
-
-
 def latent(params):
     """The policy of the trained network alone, if every look pays."""
     agent = replace(AGENT, useless=1e3)
     models = {"agent": agent, "q_networks": (params,) * 2, "tours": None, "fusion": TWO.map.fusion}
     return jax.jit(policy("latent", **models))
-
-
-@pytest.mark.parametrize("modality", [0, 1])
-def test_at_one_place_a_robot_values_what_one_that_is_alone_does(modality):
-    params = team_params()
-    reset = jax.jit(lambda key: map_mdp.reset(key, TWO.map))
-
-    @jax.jit
-    def valued(belief, team):
-        """Its values, and what comes after its looks."""
-        seen = AGENT.observe(belief, team, jnp.int32(0))
-        return AGENT.values(params, seen), AGENT.q(params, seen)
-
-    taken, act = set(), latent(params)
-    for seed in range(8):
-        state = reset(jax.random.key(seed))
-        # All at (1, 2), with a heading that is of no importance.
-        alone = team_mdp.alone(3, modality)
-        there = replace(
-            alone, positions=jnp.tile(jnp.array([1.0, 2.0]), (3, 1)), poses=jnp.array([[1, 2, 0.7]])
-        )
-        values, after = valued(state.belief, alone)
-        np.testing.assert_allclose(values, valued(state.belief, there)[0], rtol=1e-5)
-        taken.add(action := int(np.argmax(values)))
-        known = known_of(jnp.zeros((3, 3)), state.seen, modality, state.belief)
-        assert act(jax.random.key(0), known) == action
-        # They look at once: half of what comes after, without a price of time.
-        np.testing.assert_allclose(values, 0.5 * after, rtol=1e-5)
-    assert len(taken) > 1
-
-
-def test_the_latent_policy_tells_if_a_value_is_not_finite():
-    params = jax.tree.map(lambda x: x * jnp.nan, team_params())
-    known = known_of(jnp.zeros((3, 3)), jnp.zeros((3, 2)))
-    assert latent(params)(jax.random.key(0), known) == -1
 
 
 @pytest.fixture(scope="module")
@@ -149,23 +104,9 @@ def test_a_look_is_learned_from_when_its_robot_set_out(steps):
 def test_without_a_look_nothing_is_lost(steps):
     for _, _, t, _, _ in (steps[0], steps[3]):
         q_tm1, q_t = jnp.arange(4.0), jnp.full(4, 9.0)
-        assert losses.td_error(q_tm1, t.a_tm1, t.r_t, t.discount_t, q_t) == 0
-    slope = jax.grad(lambda q: losses.td_error(q, t.a_tm1, t.r_t, t.discount_t, q_t))(q_tm1)
+        assert training.td_error(q_tm1, t.a_tm1, t.r_t, t.discount_t, q_t) == 0
+    slope = jax.grad(lambda q: training.td_error(q, t.a_tm1, t.r_t, t.discount_t, q_t))(q_tm1)
     np.testing.assert_array_equal(slope, 0.0)
-
-
-def test_a_second_look_at_the_same_moment_is_learned_too():
-    # Both are as near: the second look takes no more time.
-    poses = jnp.zeros((2, 3))
-    place = learning_in(replace(TWO, places=replace(TWO.places, poses=poses)))
-    observe, step = jax.jit(place.observe), jax.jit(place.step)
-    state, found = jax.jit(place.reset)(jax.random.key(0)), []
-    for action in (0, 0, 1):
-        state, transition, outcome = step(
-            jax.random.key(1), state, observe(state), jnp.int32(action)
-        )
-        found.append((int(transition.a_tm1), float(outcome.seconds)))
-    np.testing.assert_allclose(found, [(-1, 0), (0, 6), (0, 0)], atol=1e-5)
 
 
 def test_exploring_takes_every_poi_that_is_present_and_no_other():
@@ -214,16 +155,3 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
         return agent.q(state.params, x)
 
     np.testing.assert_allclose(learned(ONCE_SEEN), ONCE_Q, atol=0.1)
-
-
-@pytest.mark.parametrize(("preset", "reward"), [("many", -0.05), ("team", -1.0)])
-def test_a_look_that_tells_nothing_earns_what_the_settings_say(preset, reward):
-    agent = make_agent(PRESETS[preset])
-    assert isinstance(agent, TeamAgent)
-    np.testing.assert_allclose(agent.useless, reward, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("preset", "discount"), [("noisy", 0.5), ("team", 0.99)])
-def test_an_agent_discounts_its_own_unit_of_time(preset, discount):
-    agent = make_agent(PRESETS[preset]).with_discount(step=0.5, second=0.99)
-    assert agent.discount == discount

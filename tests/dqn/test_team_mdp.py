@@ -1,19 +1,20 @@
 """The team's MDP with times worked by hand, on maps whose rewards are known."""
 
 import math
-from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import PLACES, Fixed, classes_mdp, noisy_mdp, team_mdp_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from toys import PLACES, TRAVEL, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
 from jaxsense.dqn import map_mdp, team_mdp
 from jaxsense.dqn.team_mdp import Team, TeamState
 
 NOP, CAMERA, LIDAR = 3, 0, 1
-FIRST, SECOND = 0.2 - 1 / np.sqrt(40), 0.8  # gains of looks, see `toys.classes_mdp`
+FIRST = 0.2 - 1 / np.sqrt(40)  # gain of a look, see `toys.classes_mdp`
 
 
 def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
@@ -144,15 +145,6 @@ def test_two_robots_as_worked_by_hand():
     np.testing.assert_array_equal(states[2].map.seen, [[1, 0], [0, 1], [0, 0]])
 
 
-def test_who_looks_again_gains_nothing_and_another_sensor_much():
-    facing = [[0, 0, 0], [0, 0, 0]]
-    # The camera looks at PoI 0 after 6 s, again after 7; the LiDAR, 6 s away too, in between.
-    states, outcomes = play(start(facing, [CAMERA, LIDAR]), 0, 0, 0, NOP, NOP)
-    np.testing.assert_allclose([o.reward for o in outcomes], [0, FIRST, SECOND, -1, 0], atol=1e-6)
-    np.testing.assert_allclose([s.seconds for s in states], [0, 6, 6, 7, 7], atol=1e-5)
-    assert [int(s.agent) for s in states[:4]] == [1, 0, 1, 0]
-
-
 def test_robots_look_side_by_side():
     # All three are near enough: each look takes 1 s, and there is one of each robot in every one.
     here = jnp.zeros((3, 2))
@@ -181,14 +173,6 @@ def test_first_choices_go_round_the_robots_that_work():
     np.testing.assert_allclose([o.seconds for o in outcomes], [0, 0, 6], atol=1e-5)
     np.testing.assert_array_equal(states[2].team.poses[1], 0.0)  # that one takes no part
     assert states[2].map.seen[0, LIDAR]
-
-
-def test_all_may_end_without_a_look():
-    states, outcomes = play(start([[0, 0, 0]] * 2, [0, 1]), NOP, NOP)
-    assert [bool(o.terminated) for o in outcomes] == [False, True]
-    assert [float(o.reward) for o in outcomes] == [0, 0]
-    assert float(states[1].seconds) == 0
-    assert not np.any(states[1].map.seen)
 
 
 def test_an_episode_is_cut_after_its_own_number_of_choices():
@@ -229,26 +213,6 @@ def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
         jax.tree.map(np.testing.assert_array_equal, team.map, known)
 
 
-@pytest.mark.parametrize(
-    ("action", "expected"),
-    [
-        (jnp.int32(4), "action = 4: must be a whole number from 0 to 3"),
-        (jnp.int32(-1), "action = -1"),
-        (jnp.float32(1), "action of dtype float32"),
-    ],
-)
-def test_an_action_that_does_not_exist_is_refused(action, expected):
-    with pytest.raises(ValueError, match=expected):
-        team_mdp.step(jax.random.key(0), MDP, start([[0, 0, 0]], [0]), action)
-
-
-def test_places_of_another_size_are_named():
-    with pytest.raises(ValueError, match="positions"):
-        team_mdp.reset(jax.random.key(0), make_mdp(places=PLACES[:2]))
-    with pytest.raises(ValueError, match="poses"):
-        team_mdp.reset(jax.random.key(0), replace(MDP, robots_each=2))
-
-
 def test_an_episode_of_a_given_team_has_these_robots_and_no_other():
     modality = jnp.array([1, 0, 1, 1])
     mdp = make_mdp(robots_each=2, alone=1.0)
@@ -261,3 +225,72 @@ def test_an_episode_of_a_given_team_has_these_robots_and_no_other():
     np.testing.assert_array_equal(state.team.positions, PLACES)
     with pytest.raises(ValueError, match="modality = 2: must be a whole number from 0 to 1"):
         team_mdp.reset(jax.random.key(0), mdp, jnp.array([0, 2, 0, 0]))
+
+
+seconds_of_ways = jax.jit(team_mdp.travel_seconds)
+move = jax.jit(team_mdp.move)
+
+
+@pytest.mark.parametrize(
+    ("pose", "place", "seconds"),
+    [
+        # A quarter turn at 1 rad/s, 2 - .9 m at .2 m/s, and the look.
+        ((0, 0, 0), (0, 2), math.pi / 2 + 5.5 + 1),
+        ((0, 0, 0), (0, -2), math.pi / 2 + 5.5 + 1),
+        # From (1, 1) to (1, 3), from which the robot looks away by .5 rad.
+        ((1, 1, math.pi / 2 - 0.5), (1, 3), 0.5 + 5.5 + 1),
+        # The short way around: from 3 to -3 rad, 2 pi - 6.
+        ((0, 0, 3.0), (-2 * math.cos(0.14159265), -2 * math.sin(0.14159265)), 0.28319 + 5.5 + 1),
+        # A heading of two turns too many.
+        ((0, 0, 4 * math.pi), (2, 0), 5.5 + 1),
+        # Near enough: only turning and looking.
+        ((0, 0, 0), (0, 0.8), math.pi / 2 + 1),
+        # All at one place: only looking, whatever the heading.
+        ((1, 2, 0.7), (1, 2), 1.0),
+    ],
+)
+def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
+    pose, places = jnp.array(pose, jnp.float32), jnp.array([place], jnp.float32)
+    np.testing.assert_allclose(seconds_of_ways(TRAVEL, pose, places), [seconds], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [
+        (0.0, (0, 0, 0)),
+        (0.5, (0, 0, 0.5)),  # still turning, to the left
+        (math.pi / 2 + 2, (0, 0.4, math.pi / 2)),  # and 2 s of driving at .2 m/s
+        (math.pi / 2 + 5.5, (0, 1.1, math.pi / 2)),
+        (99.0, (0, 1.1, math.pi / 2)),  # it waits there
+    ],
+)
+def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
+    moved = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, 2.0]), jnp.float32(seconds))
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+    mirrored = move(TRAVEL, jnp.zeros(3), jnp.array([0.0, -2.0]), jnp.float32(seconds))
+    np.testing.assert_allclose(mirrored, np.array(expected) * (1, -1, -1), atol=1e-6)
+
+
+@jax.jit
+def in_two_parts(pose, place, share):
+    """The time of a way in one part; in two; and the pose at its end, in one and in two."""
+    whole = team_mdp.travel_seconds(TRAVEL, pose, place[None])[0]
+    before = share * (whole - TRAVEL.look_seconds)
+    between = team_mdp.move(TRAVEL, pose, place, before)
+    rest = team_mdp.travel_seconds(TRAVEL, between, place[None])[0]
+    end = team_mdp.move(TRAVEL, pose, place, whole)
+    return whole, before + rest, end, team_mdp.move(TRAVEL, between, place, rest)
+
+
+PLACE = st.floats(-3, 3, width=32)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@given(st.tuples(PLACE, PLACE, PLACE), st.tuples(PLACE, PLACE), st.floats(0, 1, width=32))
+def test_a_way_in_two_parts_takes_as_long_as_in_one(pose, place, share):
+    numbers = (np.float32(x) for x in (pose, place, share))
+    one, two, end, end_of_two = in_two_parts(*numbers)
+    np.testing.assert_allclose(one, two, atol=1e-3)
+    np.testing.assert_allclose(end[:2], end_of_two[:2], atol=1e-3)
+    # A heading counts only up to full turns.
+    np.testing.assert_allclose(np.exp(1j * end[2]), np.exp(1j * end_of_two[2]), atol=2e-3)

@@ -1,5 +1,6 @@
 """What a robot of a team knows when it chooses."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from toys import PLACES, TRAVEL
 
+from jaxsense.core import networks
 from jaxsense.core.types import Belief
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn import pooling, team_mdp
+from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team_mdp import Team
 
 NOP, CAMERA, LIDAR = 3, 0, 1
@@ -68,27 +71,6 @@ def test_what_a_robot_knows_as_worked_by_hand():
     np.testing.assert_array_equal(found[7:9], [[0] * 3, [1] * 3])
 
 
-def test_of_robots_with_the_same_sensor_the_nearest_counts():
-    found = observe(team_of_three(works=jnp.ones(3, bool)), jnp.int32(1))
-    times = np.stack(
-        [
-            [6, 11 + math.pi / 2, 16 + math.pi],
-            # The second camera stands at PoI 0 and looks away from PoIs 1 and 2.
-            team_mdp.travel_seconds(TRAVEL, jnp.array([1.9, 0, 0]), PLACES),
-        ]
-    )
-    assert times[1, 0] == 1 < times[0, 0]
-    np.testing.assert_allclose(found[5], np.exp(-times.min(axis=0) / 10), atol=1e-5)
-    # It heads for PoI 0, where it is.
-    np.testing.assert_allclose(found[3], [np.exp(-0.1), 0, 0], atol=1e-5)
-
-
-def test_the_place_is_seen_from_the_robot():
-    moved = team_of_three(poses=jnp.array([[1.0, -2.0, 0.5], [0, 0, 0], [0, 0, 0]]))
-    found = observe(moved, jnp.int32(0))
-    np.testing.assert_allclose(found[-2:].T, np.asarray(PLACES) - (1.0, -2.0), atol=1e-6)
-
-
 @pytest.mark.parametrize("agent", [0, 1])
 def test_permuting_pois_permutes_what_is_known_of_them(agent):
     order = jnp.array([2, 0, 1])
@@ -111,7 +93,87 @@ def test_of_an_absent_poi_nothing_is_known():
     np.testing.assert_array_equal(found[:, [0, 2]], whole[:, [0, 2]])
 
 
-def test_a_standard_deviation_of_zero_is_refused():
-    belief = replace(BELIEF, std=BELIEF.std.at[1].set(0.0))
-    with pytest.raises(ValueError, match=r"belief\.std = 0\.0"):
-        team_mdp.observation(TRAVEL, belief, team_of_three(), jnp.int32(0), 2)
+FEATURES = team_mdp.num_features(2, 2)
+NETWORK = PoolingNetwork((6, 8), FEATURES)
+PARAMS = networks.init(jax.random.key(0), NETWORK, 3 * FEATURES)
+apply = jax.jit(lambda x: networks.apply(NETWORK, PARAMS, x.reshape(-1, *x.shape[2:])))
+
+
+def seen(number, seed=1):
+    """`[F, N]` of as many PoIs, all of which are present."""
+    return jax.random.normal(jax.random.key(seed), (FEATURES, number)).at[-3].set(1.0)
+
+
+def test_permuting_pois_permutes_their_values():
+    x = seen(4)
+    values = apply(x)
+    assert len(np.unique(values)) == 5
+    for order in itertools.permutations(range(4)):
+        permuted = apply(x[:, jnp.array(order)])
+        np.testing.assert_allclose(permuted[:4], values[jnp.array(order)], atol=1e-5)
+
+
+@pytest.mark.parametrize("filled", [0.0, 3.0])
+def test_absent_pois_change_no_value(filled):
+    x, values = seen(3), apply(seen(3))
+    absent = jnp.full((FEATURES, 2), filled).at[-3].set(0.0)
+    padded = jnp.concatenate([absent[:, :1], x, absent[:, 1:]], axis=1)
+    found = apply(padded)
+    np.testing.assert_allclose(found[jnp.array([1, 2, 3, 5])], values, atol=1e-5)
+    # Nobody takes one: NOP is worth more.
+    np.testing.assert_array_equal(found[jnp.array([0, 4])], pooling._NOTHING)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 8])
+def test_nop_is_worth_nothing_and_one_network_serves_every_number_of_pois(number):
+    values = apply(seen(number))
+    assert values.shape == (number + 1,)
+    assert values[-1] == 0
+    assert np.all(values[:-1] != 0)
+
+
+@pytest.mark.parametrize("number", [1, 2, 5])
+def test_each_poi_among_others_that_are_taken_to_be_different(number):
+    x, others = np.array(seen(number)), np.array(seen(number, seed=2))
+    others[-3:] = x[-3:]
+    if number == 5:
+        x[-3, 3] = others[-3, 3] = 0.0
+    among = jax.jit(lambda x, others: networks.apply(NETWORK, PARAMS, x.ravel(), others.ravel()))
+    found = among(x, others)
+    for poi in range(number):
+        changed = others.copy()
+        changed[:, poi] = x[:, poi]
+        np.testing.assert_allclose(found[poi], apply(changed)[poi], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(among(x, x), apply(x), atol=1e-5)
+
+
+def test_a_batch_equals_single_ones():
+    batch = jnp.stack([seen(3, seed) for seed in range(4)], axis=-1)
+    batch = batch.at[-3, 1, 2].set(0.0)
+    together = apply(batch)
+    for i in range(4):
+        np.testing.assert_allclose(together[:, i], apply(batch[:, :, i]), atol=1e-5)
+
+
+@pytest.mark.parametrize("is_absent", [False, True])
+def test_gradients_are_finite_where_all_pois_are_at_one_place(is_absent):
+    # The lengths of ways are 0 there, whose square root has no gradient.
+    x = seen(3).at[-2:].set(0.0)
+    x = jnp.where(jnp.arange(3) == 1, 0.0, x) if is_absent else x
+
+    def total(params, x):
+        return jnp.sum(networks.apply(NETWORK, params, x.reshape(-1))[:-1:2])
+
+    gradients = jax.jit(jax.grad(total, argnums=(0, 1)))(PARAMS, x)
+    assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradients))
+    assert any(np.any(g != 0) for g in jax.tree.leaves(gradients[0]))
+
+
+def test_nearness_as_worked_by_hand():
+    # From the origin over PoI 0 to each; robots look from .9 m, and drive .2 m in a second.
+    place = jnp.array([[1.9, 1.0, 5.0, -2.9], [0.0, 2.9, 0.0, 0.0]])
+    seconds = pooling._seconds_between(place)[0]
+    # It stops 1 m ahead. PoI 0 is near enough; PoI 1 a quarter turn and 2 m to drive; PoI 2 4 m
+    # straight on, 3.1 to drive; PoI 3 a half turn and 3.9 m behind it, 3 to drive.
+    expected = [0, np.pi / 2 + 2 / 0.2, 3.1 / 0.2, np.pi + 3.0 / 0.2]
+    np.testing.assert_allclose(seconds, expected, atol=1e-3)

@@ -12,8 +12,7 @@ from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import policies, rewards, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.dqn.travel import Travel
+from jaxsense.dqn.team_mdp import TeamMdp, Travel
 
 SENSORS = ("camera", "lidar")
 TRAVEL = Travel(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)

@@ -18,8 +18,7 @@ from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.dqn.team_mdp import Team
 from jaxsense.interfaces.robot import load
-from jaxsense.mission import memory
-from jaxsense.mission.maps import OwnMap
+from jaxsense.mission.maps import MOST_LOOKS, OwnMap, empty
 from jaxsense.vae import readout
 
 OWN = dataclasses.replace(
@@ -102,7 +101,7 @@ def test_maps_are_merged_as_missions_merge_them(models, own_maps):
     _, programs = own_maps
     assert not {"write_camera", "write_lidar"} & {*programs}
     rng, modality = np.random.default_rng(0), np.array([0, 1, 1], np.int32)
-    held, sums = memory.empty(jnp.asarray(modality), 3), np.zeros((3, 5, 3), np.float32)
+    held, sums = empty(jnp.asarray(modality), 3), np.zeros((3, 5, 3), np.float32)
 
     @jax.jit
     def remember(held, robot, poi, evidence):
@@ -126,7 +125,7 @@ def test_maps_are_merged_as_missions_merge_them(models, own_maps):
         np.testing.assert_allclose(told, found.log_likelihood, atol=1e-5)
         if look // 3 < hears_of[robot]:
             sums[robot, poi] += told
-    is_known = held.taken() & (jnp.arange(memory.MOST_LOOKS)[None] < hears_of[:, None])
+    is_known = held.taken() & (jnp.arange(MOST_LOOKS)[None] < hears_of[:, None])
     expected = jax.jit(lambda held: OwnMap(held, is_known, 5).read(models).belief)(held)
     merged = programs["merge"](sums=sums)
     np.testing.assert_allclose(merged["mean"], expected.mean, atol=1e-5)
@@ -137,7 +136,7 @@ def test_maps_are_merged_as_missions_merge_them(models, own_maps):
 
 def test_a_message_that_comes_twice_is_counted_once(own_maps, example):
     contents, programs = own_maps
-    assert contents["remembered_looks"] == memory.MOST_LOOKS
+    assert contents["remembered_looks"] == MOST_LOOKS
     maps = [example["empty"](contents, 3) for _ in range(2)]
     place = np.array([0.5, 0.2], np.float32)
     maps[0]["sums"][0, 1] = [0.0, -2.0, -3.0]

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE, alone, with_config, with_eyes
+from teams import CONFIG, NAIVE, alone, decide_alone, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.mission import act, decide
+from jaxsense.mission import act
 
 
 @pytest.fixture(scope="session")
@@ -75,7 +75,7 @@ def decides(team, as_numpy):
 
     def choose(key, models, state, rules):
         changed = replace(CONFIG, mission=replace(CONFIG.mission, **rules))
-        return decide.decide(key, with_config(team, changed), models, state, 0)
+        return decide_alone(key, with_config(team, changed), models, state, 0)
 
     jitted = jax.jit(choose)
     # JAX would compile another program for weakly typed numbers.

@@ -9,6 +9,7 @@ import numpy as np
 from jaxsense import dqn, mission
 from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
+from jaxsense.mission import decide
 from jaxsense.vae import detectors, readout
 
 # Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
@@ -92,3 +93,10 @@ def with_values(models, *values):
 
     networks = tuple(constant(n, v) for n, v in zip(models.q_networks, values, strict=True))
     return replace(models, q_networks=networks)
+
+
+def decide_alone(key, mission, models, state, robot):
+    """The state after a decision of one robot in one mission."""
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
+    chosen = decide.choices(key[None], mission, models, batch, robot, batch.policy[0])[0]
+    return decide.set_out(mission, models, state, robot, chosen)

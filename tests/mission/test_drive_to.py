@@ -1,4 +1,3 @@
-import dataclasses
 import functools
 
 import jax
@@ -45,21 +44,6 @@ def test_arcs_are_those_of_a_unicycle(turn_rate):
     np.testing.assert_allclose(np.stack([x, y, cos, sin], axis=1), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.1, 0.2])
-def test_arcs_are_a_grid_of_all_speeds_and_the_turn_rates_within_reach(seconds):
-    # One speed backwards and five of 0 to 0.2 m/s; 21 turn rates of -1 to 1 rad/s.
-    speeds, turn_rates = [-0.1, 0, 0.05, 0.1, 0.15, 0.2], 0.1 * np.arange(-10, 11)
-    for present in np.linspace(-1.05, 1.05, 43):
-        samples = np.array(arcs_of(present, seconds)[0])
-        # Twice 3.2 rad/s^2 for 0.05, 0.1 and 0.2 s hold 0.32, 0.64 and 1.28 rad/s.
-        assert len(samples) == 6 * {0.05: 4, 0.1: 7, 0.2: 13}[seconds]
-        np.testing.assert_allclose(np.unique(samples[:, 0]), speeds, atol=1e-6)
-        tried = np.unique(samples[:, 1])
-        assert len(np.unique(samples, axis=0)) == 6 * len(tried) == len(samples)
-        in_reach = turn_rates[np.abs(turn_rates - present) <= 3.2 * seconds + 1e-6]
-        assert all(np.abs(tried - turn_rate).min() < 1e-6 for turn_rate in in_reach)
-
-
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 @pytest.mark.parametrize(
     ("goal", "expected"),
@@ -77,11 +61,6 @@ def test_a_robot_at_rest_sets_out_for_its_waypoint(command_to, yaw, goal, expect
     waypoint = turned(yaw, goal[0] - 0.2, goal[1] + 0.1)
     command = command_to(layout_of(), poses, [[0.0, 0.0]], waypoint)
     np.testing.assert_allclose(command, expected, atol=1e-6)
-
-
-def test_a_robot_at_full_speed_goes_on_straight_ahead(command_to):
-    command = command_to(layout_of(), [[-1.0, 0.5, 0.0]], [[0.2, 0.0]], [1.0, 0.5])
-    np.testing.assert_allclose(command, [0.2, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.04])
@@ -127,21 +106,6 @@ def test_a_robot_for_which_no_arc_is_safe_stops(command_to, speed, is_safe, back
         np.testing.assert_array_equal(command, 0)
 
 
-@pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize(("beside", "is_free"), [(0.2114, False), (0.245, True)])
-def test_a_robot_does_not_cut_through_the_edge_of_what_it_must_keep_off(
-    command_to, side, beside, is_free
-):
-    # Straight ahead, it would be nearer than 0.2414 to the PoI from 0.22 - 0.1166 on, and out again
-    # at 0.22 + 0.1166 m, before the end of the arc at 0.4 m: 0.1166^2 + 0.2114^2 = 0.2414^2.
-    layout = layout_of((0.22, side * beside))
-    command = command_to(layout, [[0.0, 0.0, 0.0]], [[0.2, 0.0]], [1.0, 0.0])
-    if is_free:
-        np.testing.assert_allclose(command, [0.2, 0.0], atol=1e-6)
-    else:
-        assert side * command[1] < 0
-
-
 @pytest.mark.parametrize(("ahead", "is_free"), [(0.39, False), (0.4, True)])
 def test_a_robot_does_not_rely_on_another_to_drive_on(command_to, ahead, is_free):
     # At full speed it is at its waypoint in 1 s, 0.2 m on. The other drives ahead as fast, but has
@@ -149,56 +113,6 @@ def test_a_robot_does_not_rely_on_another_to_drive_on(command_to, ahead, is_free
     poses = [[0.0, 0.0, 0.0], [ahead, 0.0, 0.0]]
     command = command_to(layout_of(), poses, [[0.2, 0.0], [0.2, 0.0]], [0.2, 0.0])
     assert np.allclose(command, [0.2, 0.0]) == is_free
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_a_robot_that_turns_goes_on_that_way_round_if_it_is_shorter(command_to, side):
-    # The waypoint is 166 degrees to the one side. Turning to the other at 0.9 rad/s, there remain
-    # 194 degrees; to stop first and turn back takes longer.
-    waypoint = [-1.0, 0.25 * side]
-    command = command_to(layout_of(), [[0.0, 0.0, 0.0]], [[0.0, -0.9 * side]], waypoint)
-    assert command[1] == pytest.approx(-1.0 * side, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("distance", "forward"),
-    [
-        # In the 1 s of its shortest arc, it gets 0.02 m beyond at full speed: so near, it matters
-        # little that it would have to turn round, and 1 s + 0.02 / 0.2 s is less than at 0.15 m/s,
-        # 1 s + 0.03 / 0.2 s.
-        (0.18, 0.2),
-        (0.1, 0.1),  # there in 1 s; twice as fast, it would have to come back
-    ],
-)
-def test_a_robot_does_not_slow_down_for_a_waypoint_that_it_hardly_passes(
-    command_to, distance, forward
-):
-    command = command_to(layout_of(), [[0.0, 0.0, 0.0]], [[0.2, 0.0]], [distance, 0.0])
-    np.testing.assert_allclose(command, [forward, 0.0], atol=1e-6)
-
-
-@pytest.mark.parametrize("side", [1, -1])
-@pytest.mark.parametrize("bias", [0.003, -0.003])
-def test_of_two_ways_the_one_farther_from_a_poi_is_taken(command_to, side, bias):
-    # The waypoint is behind, hardly to either side. A robot that turns left backs up to the right.
-    command = [
-        command_to(layout, [[0.0, 0.0, 0.0]], [[0.0, 0.0]], [-1.0, bias])
-        for layout in (layout_of((-0.2, 0.3 * side)), layout_of())
-    ]
-    expected = [[-0.1, 0.3 * side], [-0.1, 0.3 * np.sign(bias)]]
-    np.testing.assert_allclose(command, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("side", [1, -1])
-def test_a_way_costs_what_its_place_nearest_to_a_poi_does(command_to, side):
-    # 0.02 m from where it must not be, which costs 0.08 s, a robot turns to a waypoint 1 m away at
-    # 85 degrees. To back up meanwhile to (-0.0985, -0.0148), 0.12 m away from there, would make the
-    # way hypot(0.1857, 1.0110) - 1 = 0.0279 m or 0.140 s longer, and turning by 5.4 degrees or
-    # 0.094 s shorter. That is not worth the 0.02 s which are saved after the first 0.02 m, when the
-    # cost is 0.06 s; it would be worth the 0.08 s of the end.
-    waypoint = [np.cos(np.radians(85)), side * np.sin(np.radians(85))]
-    command = command_to(layout_of((0.2614, 0.0)), [[0.0, 0.0, 0.0]], [[0.0, 0.0]], waypoint)
-    np.testing.assert_allclose(command, [0.0, 0.3 * side], atol=1e-6)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
@@ -246,34 +160,145 @@ def test_a_robot_that_backs_off_gains_room(command_to, poses, in_the_way, forwar
     assert command[0] == pytest.approx(forward, abs=1e-6)
 
 
-def drive(poses, commands, waypoint):
-    args = jnp.zeros(poses), jnp.zeros(commands), 0, jnp.zeros(waypoint), PERIOD, jnp.bool_(False)
-    return navigation.drive_to(ARENA, layout_of(), *args)
+def move(layout, poses, commands, wanted):
+    """Poses and commands after one period of driving like a unicycle, and the least clearance."""
+
+    def step(state, _):
+        poses, commands = state
+        commands = navigation.ramp(commands, wanted, 0.01)
+        forward, turn = commands[:, 0], commands[:, 1]
+        heading = poses[:, 2] + 0.005 * turn
+        velocity = jnp.stack([forward * jnp.cos(heading), forward * jnp.sin(heading), turn], -1)
+        poses += 0.01 * velocity
+        return (poses, commands), jnp.min(navigation.clearance(ARENA, layout, poses))
+
+    (poses, commands), clearance = jax.lax.scan(step, (poses, commands), length=10)
+    return poses, commands, jnp.min(clearance)
+
+
+@pytest.fixture(scope="module")
+def met():
+    """Two robots that drive at each other, or one at another that stands, in B directions.
+
+    How far robot 1 is beside the way of robot 0, paths as seen along it `[B, T, 2, 2]`, distances
+    to the goals `[B, T, 2]`, and the least clearance.
+    """
+
+    def meet(yaw, beside, stands):
+        turn = jnp.array([[jnp.cos(yaw), -jnp.sin(yaw)], [jnp.sin(yaw), jnp.cos(yaw)]])
+        starts = jnp.array([[-0.9, 0.0], [0.9, 0.0]]) + beside * jnp.array([[0.0, 0.0], [0.0, 1.0]])
+        goals = starts * jnp.array([[-1.0, 1.0]])
+        starts = jnp.where(stands, starts * jnp.array([[1.0, 1.0], [0.0, 1.0]]), starts)
+        yaws = jnp.stack([yaw, yaw + jnp.pi])
+        goals = goals @ turn.T
+
+        def step(state, _):
+            poses, commands = state
+            wanted = [
+                navigation.drive_to(
+                    ARENA, layout_of(), poses, commands, r, goal, PERIOD, jnp.bool_(False)
+                )
+                for r, goal in enumerate(goals)
+            ]
+            wanted[1] = jnp.where(stands, 0.0, wanted[1])
+            poses, commands, clearance = move(layout_of(), poses, commands, jnp.stack(wanted))
+            return (poses, commands), (poses, clearance)
+
+        state = jnp.concatenate([starts @ turn.T, yaws[:, None]], axis=-1), jnp.zeros((2, 2))
+        _, (path, clearance) = jax.lax.scan(step, state, length=150)
+        away = jnp.linalg.norm(path[..., :2] - goals[None], axis=-1)
+        return path[..., :2] @ turn, away, clearance.min()
+
+    meet = jax.jit(jax.vmap(meet))
+
+    def run(stands):
+        yaw = np.linspace(-3, 3, 25, dtype=np.float32)
+        beside = np.tile(np.linspace(-0.2, 0.2, 5, dtype=np.float32), 5)
+        return beside, *jax.tree.map(np.array, meet(yaw, beside, np.full(25, stands)))
+
+    return run
+
+
+def test_two_robots_that_drive_at_each_other_pass_and_do_not_touch(met):
+    beside, path, away, clearance = met(stands=False)
+    # Planning keeps their middles 2 * 0.1 - 0.005 apart, of which 2 * 0.0495 are the robots.
+    assert clearance.min() > 0.09
+    # 1.6 m to within 0.2 m at 0.2 m/s take 8 s.
+    seconds = PERIOD * (1 + np.argmax(away < 0.2, axis=1))
+    assert (away.min(axis=1) < 0.2).all()
+    assert np.all((seconds >= 7.9) & (seconds < 11))
+    # Head-on, each goes to its right.
+    head_on = path[np.abs(beside) < 1e-6]
+    assert np.all(head_on[:, :, 0, 1].min(axis=1) < -0.05)
+    assert np.all(head_on[:, :, 1, 1].max(axis=1) > 0.05)
+
+
+@pytest.fixture(scope="module")
+def sidestep():
+    step = jax.jit(functools.partial(navigation.sidestep, ARENA))
+
+    def from_origin(others, layout=None, place=(0.0, 0.0)):
+        """The next place on the way to 1 m further east, seen from where the robot is."""
+        place, others = jnp.array(place), jnp.array(others).reshape(-1, 2) + jnp.array([place])
+        layout = layout_of() if layout is None else layout
+        return np.array(step(layout, place, place + jnp.array([1.0, 0.0]), others) - place)
+
+    return from_origin
 
 
 @pytest.mark.parametrize(
-    ("name", "call", "right", "wrong"),
+    "others",
     [
-        ("waypoint", lambda shape: drive((2, 3), (2, 2), shape), (2,), (3,)),
-        ("commands", lambda shape: drive((2, 3), shape, (2,)), (2, 2), (3, 2)),
-        (
-            "poses",
-            lambda shape: navigation.clearance(ARENA, layout_of(), jnp.zeros(shape)),
-            (2, 3),
-            (2, 4),
-        ),
+        [],
+        [(0.5, 0.235)],  # 0.2 + 0.03 beside the way are enough
+        [(0.5, -0.235)],
+        [(-0.1, 0.0)],  # behind
+        [(1.05, 0.0)],  # beyond the waypoint
+        [(1e3, 1e3)],
     ],
 )
-def test_wrong_shapes_are_named_while_tracing(name, call, right, wrong):
-    jax.eval_shape(lambda: call(right))
-    with pytest.raises(ValueError, match=name):
-        jax.eval_shape(lambda: call(wrong))
+def test_with_nobody_in_the_way_the_waypoint_stays(sidestep, others):
+    np.testing.assert_array_equal(sidestep(others), [1.0, 0.0])
 
 
-@pytest.mark.parametrize("horizon", [1.0, 4.0])
-def test_a_robot_may_leave_its_arc_after_half_the_horizon(horizon):
-    settings = dataclasses.replace(horizon=horizon)
-    waypoint = jnp.array([0.1 * horizon / 2, 0.0])  # where it is by then at 0.1 m/s
-    args = layout_of(), jnp.zeros((1, 3)), jnp.array([[0.2, 0.0]]), 0, waypoint, PERIOD
-    drive_to = jax.jit(functools.partial(navigation.drive_to, settings, ARENA, *args))
-    np.testing.assert_allclose(drive_to(jnp.bool_(False)), [0.1, 0.0], atol=1e-6)
+# From 0.52 m away, tangents to a circle of 2 * 0.1 + 0.06 = 0.26 m leave at 30 degrees to either
+# side and touch it after sqrt(0.52^2 - 0.26^2) = 0.450333 m, at (0.39, +-0.225167).
+RIGHT, LEFT = (0.39, -0.225167), (0.39, 0.225167)
+
+
+def at(distance, degrees):
+    return distance * np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        ((0.52, 0.0), RIGHT),
+        (at(0.52, 10), at(0.450333, -20)),  # to the left of the way: the right side is shorter
+        (at(0.52, 1), at(0.450333, -29)),
+        (at(0.52, -1), at(0.450333, -31)),  # left is shorter, but by less than 0.05 m
+        (at(0.52, -10), at(0.450333, 20)),
+        # Closer than 0.26, outwards: 0.15 m at 90 degrees + 1 - 0.2 / 0.26 = 0.230769 rad.
+        ((0.2, 0.0), (-0.034309, -0.146024)),
+        (at(0.52, 25), at(0.450333, -5)),  # 0.22 beside the way: just in it
+    ],
+)
+def test_a_robot_in_the_way_is_passed_on_the_shorter_side(sidestep, other, expected):
+    np.testing.assert_allclose(sidestep([other]), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("place", "in_the_way", "expected"),
+    [
+        ((0.0, 0.0), [(0.39, -0.46)], LEFT),  # 0.2348 from the place on the right, less than 0.2414
+        ((0.0, 0.0), [(0.39, -0.47)], RIGHT),  # 0.2448
+        ((0.0, 0.0), [(0.39, 0.46)], RIGHT),
+        ((0.0, 0.0), [(0.39, -0.46), (0.39, 0.46)], (1.0, 0.0)),
+        ((0.0, -1.18), [], LEFT),  # on the right, 1.5 - 1.18 - 0.2252 = 0.0948 to the wall
+        ((0.0, -1.17), [], RIGHT),  # 0.1048
+        ((0.0, 1.3), [], RIGHT),
+    ],
+)
+def test_a_robot_in_the_way_is_passed_where_there_is_room(sidestep, place, in_the_way, expected):
+    step = sidestep([(0.52, 0.0)], layout_of(*in_the_way), place)
+    np.testing.assert_allclose(step, expected, atol=1e-5)

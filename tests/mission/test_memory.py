@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, LATENT, POSES, POSITIONS, alone, with_config, with_eyes
+from teams import CONFIG, LATENT, POSES, POSITIONS, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
@@ -15,16 +15,14 @@ from jaxsense.config import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.mission import act, decide, memory
-from jaxsense.mission.maps import Contents, OwnMap, SharedMap, map_of
-from jaxsense.mission.memory import MOST_LOOKS, Evidence
+from jaxsense.mission import maps
+from jaxsense.mission.maps import MOST_LOOKS, Contents, Evidence, OwnMap, SharedMap
 from jaxsense.mission.rollout import _repeat_messages
-from jaxsense.mission.state import DRIVING, FACING, FAILED
+from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
 from jaxsense.vae.filter import Filter
 
 MODALITY = jnp.array([0, 1, 1])
-OWN = CommunicationConfig(own_maps=True)
 NOTHING = Evidence(jnp.zeros(3), jnp.zeros(3))
 
 
@@ -92,7 +90,7 @@ def test_messages_leave_known_what_a_protocol_with_counters_does():
     draw = jax.jit(lambda key: jax.random.bernoulli(key, 0.4, (3, 3)))
     draw_delay = jax.jit(lambda key: 2.0 * jax.random.uniform(key, (3, 3), maxval=2.0))
     heard_by = jax.jit(lambda held, robot, time: held.known_to(robot, time))
-    rng, held = np.random.default_rng(0), memory.empty(MODALITY, 3)
+    rng, held = np.random.default_rng(0), maps.empty(MODALITY, 3)
     numbers, messages, known, overtaken = [0, 0, 0], [], np.zeros((3, 3), int), 0
     for step in range(60):
         time = 0.5 * step
@@ -125,77 +123,23 @@ def test_messages_leave_known_what_a_protocol_with_counters_does():
     assert overtaken > 5
 
 
-def test_a_message_that_comes_twice_or_after_a_newer_one_changes_no_map(own_models):
-    """Robot 0 tells of its first look, which arrives late, and then of both looks, twice."""
-    rng, sends = np.random.default_rng(0), jnp.array([True, False, False])
-    of_look = lambda: Evidence(jnp.asarray(rng.normal(size=3), jnp.float32), jnp.zeros(3))  # noqa: E731
-    first, second = of_look(), of_look()
-    late = CommunicationConfig(own_maps=True, delay=4.0)
-    held = looked(memory.empty(MODALITY, 3), 0, seconds=1.0, evidence=first)
-    held = tell(held, jax.random.key(0), late, jnp.float32(1.0), sends)
-    arrives = np.asarray(held.heard_at[1, 0, 0])
-    assert 3.0 < arrives < 9.0
-    held = looked(held, 0, seconds=2.0, evidence=second)
-    newer = tell(held, jax.random.key(1), OWN, jnp.float32(2.0), sends)
-    again = tell(newer, jax.random.key(2), late, jnp.float32(2.0), sends)
-    read = jax.jit(
-        lambda held, seconds: OwnMap(held, held.known_to(1, seconds), 2).read(own_models)
-    )
-    nothing, both = (read(again, np.float32(seconds)) for seconds in (1.9, 2.0))
-    expected = memory.belief_of(own_models.fusion, first.log_likelihood + second.log_likelihood)
-    np.testing.assert_array_equal(nothing.times_seen, 0)
-    np.testing.assert_array_equal(both.times_seen[0], [2, 0])
-    np.testing.assert_allclose(both.belief.mean[0], expected.mean, atol=1e-6)
-    # When the late one has come, and the copy, and before they have.
-    for told in (newer, again):
-        for seconds in (2.0, arrives - 0.01, arrives, 20.0):
-            after = read(told, np.float32(seconds))
-            jax.tree.map(np.testing.assert_array_equal, after, both)
-
-
-def test_without_losses_and_delay_all_know_all_at_once():
-    held = looked(looked(memory.empty(MODALITY, 3), 0, seconds=1.0), 2, seconds=3.0)
-    held = tell(held, jax.random.key(0), OWN, jnp.float32(3.0), jnp.array([1, 0, 1], bool))
-    for robot in range(3):
-        np.testing.assert_array_equal(held.known_to(robot, 3.0).sum(axis=1), [1, 0, 1])
-    # Before, only the robot itself knew.
-    np.testing.assert_array_equal(held.known_to(0, 2.9).sum(axis=1), [1, 0, 0])
-    np.testing.assert_array_equal(held.known_to(1, 2.9).sum(axis=1), [0, 0, 0])
-
-
-def test_as_many_messages_are_lost_and_as_late_as_the_settings_say():
-    settings = CommunicationConfig(own_maps=True, loss=0.25, delay=2.0)
-    held = looked(memory.empty(MODALITY, 3), 0, seconds=5.0)
-    sends = jnp.array([True, False, False])
-    of_each = jax.vmap(lambda key: held.after_messages(key, settings, jnp.float32(5.0), sends))
-    at = np.asarray(
-        jax.jit(of_each)(jax.random.split(jax.random.key(0), 4000)).heard_at[:, 1:, 0, 0]
-    )
-    assert np.isinf(at).mean() == pytest.approx(0.25, abs=0.02)
-    came = at[np.isfinite(at)]
-    assert (came.min(), came.max()) == pytest.approx((5.0, 9.0), abs=0.05)
-    assert came.mean() == pytest.approx(7.0, abs=0.05)
-
-
 def test_sums_are_of_the_looks_that_are_known():
     says = lambda *values: Evidence(jnp.array(values), 10 * jnp.array(values))  # noqa: E731
-    held = memory.empty(MODALITY, 3)
+    held = maps.empty(MODALITY, 3)
     held = looked(held, 0, poi=1, evidence=says(1.0, 0.0, 0.0), place=(1.0, 0.0))
     held = looked(held, 0, poi=0, evidence=says(0.0, 2.0, 0.0))
     held = looked(held, 1, poi=1, evidence=says(0.0, 0.0, 4.0), place=(0.0, 3.0))
     own, every = held.known_to(0, jnp.float32(0)), held.taken()
     np.testing.assert_array_equal(held.total(own, 2).log_likelihood, [[0, 2, 0], [1, 0, 0]])
     np.testing.assert_array_equal(held.total(every, 2).exact, [[0, 20, 0], [10, 0, 40]])
-    np.testing.assert_array_equal(held.times_seen(own, 2, 2), [[1, 0], [1, 0]])
-    np.testing.assert_array_equal(held.times_seen(every, 2, 2), [[1, 0], [1, 1]])
     # Of PoI 1, the LiDAR has looked from (0, 3) only, as far as all know.
-    apart = held.apart(every, jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)
+    apart = OwnMap(held, every, 2).apart(jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)
     np.testing.assert_allclose(np.sort(apart[0])[:2], [5.0, np.inf])
-    assert np.isinf(held.apart(own, jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)).all()
+    assert np.isinf(OwnMap(held, own, 2).apart(jnp.array([[4.0, 0.0]]), jnp.int32(1), 1)).all()
 
 
 def test_a_full_memory_takes_nothing_more():
-    held = memory.empty(MODALITY, 3)
+    held = maps.empty(MODALITY, 3)
     full = replace(held, number=held.number.at[0].set(MOST_LOOKS))
     after = looked(full, 0, evidence=Evidence(jnp.ones(3), jnp.ones(3)))
     jax.tree.map(np.testing.assert_array_equal, replace(after, number=full.number), full)
@@ -203,7 +147,7 @@ def test_a_full_memory_takes_nothing_more():
 
 def test_looks_one_by_one_come_to_the_shared_map(own_models):
     """To rounding: `MIN_PROBABILITY` is far below these."""
-    fusion, held = own_models.fusion, memory.empty(MODALITY, 3)
+    fusion, held = own_models.fusion, maps.empty(MODALITY, 3)
     tiled = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), fusion.prior)
     prior = jnp.tile(own_models.bayes.prior, (2, 1))
     shared = Contents(tiled, prior, jnp.zeros((2, 2), jnp.int32))
@@ -238,42 +182,6 @@ def test_looks_one_by_one_come_to_the_shared_map(own_models):
     np.testing.assert_array_equal(read.times_seen, [[0, 0], [3, 3]])
 
 
-@pytest.fixture(scope="module")
-def scan(own_team, own_models):
-    """A scan by robot 0."""
-
-    @jax.jit
-    def of_one(key, state, config):
-        changed = with_config(own_team, config)
-        return alone(lambda key, state: act.scan(key, changed, own_models, state, 0))(key, state)
-
-    return of_one
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("delay", "hears"), [(0.0, True), (5.0, False)])
-def test_a_scan_is_remembered_and_told(
-    scan, own_team, own_models, own_arena, set_robot, delay, hears
-):
-    state = own_arena([[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]], [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]])
-    state = set_robot(state, 0, phase=FACING, target=0, progress_at=-100.0)
-    state = set_robot(state, 1, phase=DRIVING, target=0)
-    after = scan(jax.random.key(0), state, communicating(CONFIG, delay=delay))
-    assert after.robots.detections[0] == 1
-    own, others = (map_of(own_team, after, robot) for robot in (0, 1))
-    assert (own.version, others.version) == (1, hears)
-    # The map of all looks has it at once, and the robot itself.
-    np.testing.assert_array_equal(after.times_seen, [[1, 0], [0, 0], [0, 0]])
-    read = own.read(own_models)
-    np.testing.assert_allclose(read.belief.mean, after.belief.mean, atol=1e-6)
-    np.testing.assert_allclose(read.log_posterior, after.log_posterior, atol=1e-6)
-    assert np.abs(after.belief.mean[0]).max() > 0.01
-    # News make a robot that drives decide again, by what it knows.
-    assert decide.is_due(own_team, after, 1) == hears
-    looks = decide.known_to(own_team, own_models, after, 1).looks
-    np.testing.assert_array_equal(looks, after.times_seen * hears)
-
-
 def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
     state = own_arena(POSITIONS, POSES)
     state = replace(state, memory=looked(state.memory, 0))
@@ -281,9 +189,9 @@ def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
     # Once a second, every ten control periods.
     for steps, version in ((9, 0), (10, 1), (11, 0), (20, 1)):
         after = repeat(replace(state, steps=jnp.int32(steps)))
-        assert map_of(own_team, after, 1).version == version
+        assert own_team.map_of(after, 1).version == version
     failed = set_robot(replace(state, steps=jnp.int32(10)), 0, phase=FAILED)
-    assert map_of(own_team, repeat(failed), 1).version == 0
+    assert own_team.map_of(repeat(failed), 1).version == 0
 
 
 @pytest.mark.slow  # compiles a mission twice

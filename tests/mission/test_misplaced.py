@@ -1,13 +1,12 @@
 """What robots do that are elsewhere than they believe."""
 
-import functools
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, POSES, POSITIONS, alone, with_config, with_values
+from teams import CONFIG, POSES, POSITIONS, with_config
 
 from jaxsense import mission
 from jaxsense.config import LocalisationConfig, Search
@@ -60,66 +59,6 @@ def test_a_detector_is_given_the_distance_that_the_robot_believes(scan, facing):
         assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
 
 
-@pytest.fixture(scope="module")
-def certain(models):
-    """Models whose detectors are certain of what they find, as trained ones are."""
-    sure = (replace(detector, sharpness=np.float32(300)) for detector in models.detectors)
-    return replace(models, detectors=tuple(sure))
-
-
-def test_a_poi_is_found_in_a_whole_scan_where_an_error_explains_it(team, certain):
-    lidar = team.world.sensors[LIDAR]
-    # 30 rays, .7 m away, whose middle is 40 rays or 14.1 degrees from the expected bearing.
-    scan = np.full(len(lidar.angles), 3.0, np.float32)
-    scan[341 + 40 - 15 : 341 + 40 + 15] = 0.7
-
-    @functools.partial(jax.jit, static_argnums=1)
-    def detects(scan, search, bearing):
-        return certain.detect(LIDAR, lidar, scan, bearing, 0.8, search).is_there
-
-    def is_there(scan, search, bearing=0.0):
-        return detects(scan, search, np.float32(bearing))
-
-    assert not is_there(scan, Search())
-    assert is_there(scan, Search(heading=14.0))
-    assert is_there(scan[::-1], Search(heading=14.0))
-    assert not is_there(scan, Search(heading=5.0))
-    # What is wrong elsewhere in the scan does not matter, and nobody searches beyond its ends.
-    broken = np.where(np.arange(len(scan)) < 260, np.nan, scan)
-    assert is_there(broken, Search(heading=14.0))
-    assert not is_there(np.where(scan == 3.0, np.nan, scan), Search(heading=14.0))
-    assert not is_there(scan, Search(heading=30.0), 2.5)
-
-
-@pytest.mark.parametrize("robot", [pytest.param(CAMERA, marks=pytest.mark.slow), LIDAR])
-@pytest.mark.parametrize(
-    ("search", "degrees", "aside", "detections"),
-    [
-        (Search(heading=12.0), -15.0, 0.0, 1),
-        pytest.param(Search(heading=3.0), -15.0, 0.0, 0, marks=pytest.mark.slow),
-        # .2 m across a view of .8 m are 14 degrees.
-        pytest.param(Search(position=0.15), 0.0, 0.2, 1, marks=pytest.mark.slow),
-        pytest.param(Search(position=0.04), 0.0, 0.2, 0, marks=pytest.mark.slow),
-    ],
-)
-def test_a_robot_that_searches_finds_what_its_errors_explain(
-    searches, facing, robot, search, degrees, aside, detections
-):
-    turned = np.radians(degrees)
-    state = facing(robot, [0.0, aside, turned], [0.0, -aside, -turned])
-    robots = searches(search)(state, robot).robots
-    assert (robots.looks[robot], robots.detections[robot]) == (1, detections)
-
-
-@pytest.mark.slow
-def test_a_robot_that_searches_tries_other_distances(searches, facing):
-    # The LiDAR refuses what is more than .24 m nearer than expected. The cube's side is, by .3 m.
-    state = facing(LIDAR, [0.0, 0.0, 0.0], [-0.2, 0.0, 0.0])
-    for position, detections in ((0.03, 0), (0.12, 1)):
-        robots = searches(Search(position=position))(state, LIDAR).robots
-        assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
-
-
 def test_a_robot_that_searches_looks_from_farther_away(team, facing):
     # It is .35 m from the PoI, and looks from .3 m and farther.
     state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
@@ -136,26 +75,6 @@ def searching(search):
     return replace(CONFIG, mission=replace(CONFIG.mission, localisation=localisation))
 
 
-@pytest.fixture(scope="module")
-def searches(team, certain):
-    @functools.cache
-    def of(search):
-        wide = with_config(team, searching(search))
-
-        @jax.jit
-        def of_one(key, state, robot):
-            return alone(lambda key, state: act.scan(key, wide, certain, state, robot))(key, state)
-
-        return lambda state, robot: of_one(jax.random.key(0), state, robot)
-
-    return of
-
-
-def test_a_look_is_remembered_at_the_place_that_the_robot_believes(scan, facing):
-    after = scan(jax.random.key(0), facing(CAMERA, [0.0, 0.0, 0.0], [0.05, -0.02, 0.0]), CAMERA)
-    np.testing.assert_allclose(after.looked_from[0, CAMERA, 0], [0.05, -0.02], atol=1e-6)
-
-
 def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):
     approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA)[0])
     viewpoint = facing(CAMERA, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).roadmap.viewpoints[0, 0]
@@ -169,15 +88,6 @@ def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, fac
         state = facing(CAMERA, pose, [error, 0.0, 0.0])
         state = set_robot(state, CAMERA, phase=DRIVING, view=0, path_left=0.5, progress_at=0.0)
         assert approach(state).robots.phase[CAMERA] == phase
-
-
-def test_a_robot_chooses_the_poi_that_it_believes_to_be_nearest(arena_of, models, decides):
-    equal = with_values(models, [1.0, 1.0, 1.0, 0.0], [1.0, 1.0, 1.0, 0.0])
-    state = arena_of(POSITIONS, POSES, policy=0)
-    assert decides(equal, state).robots.target[0] == 1
-    # From (0.6, 0), PoI 0 is at 0.4 m and PoI 1 at 1.0 m.
-    misplaced = replace(state, pose_error=state.pose_error.at[0, 0].set(0.6))
-    assert decides(equal, misplaced).robots.target[0] == 0
 
 
 def test_errors_are_of_the_robots_that_drive(team, arena_of):
@@ -218,11 +128,3 @@ def test_a_mission_starts_with_constant_errors(team, models):
     same, none, _ = begin(keys, LocalisationConfig())
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(none, 0.0)
-
-
-def test_errors_must_be_of_all_robots(team, models, arena_of):
-    state = arena_of(POSITIONS, POSES)
-    start = functools.partial(mission.start, team, models)
-    given = state.scene, state.classes, state.policy, state.faults
-    with pytest.raises(ValueError, match="pose_error"):
-        jax.eval_shape(lambda: start(*given, pose_error=jnp.zeros((3, 3))))

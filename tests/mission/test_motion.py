@@ -6,28 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, NAIVE
+from teams import CONFIG
 
 from jaxsense import mission
-from jaxsense.mission import motion
+from jaxsense.mission.rollout import move as move_all
 from jaxsense.sim import amiro
 
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
-
-
-@pytest.mark.slow  # a minute, mostly compiling; before a release
-def test_missions_with_contacts_always_and_never_computed_take_the_same_decisions(team, models):
-    never = mission.make_mission(CONFIG, contacts=False)
-    always = mission.Mission(team.world, team.world.arena, team.config, team.policies)
-    keys = jax.random.split(jax.random.key(2), 6)
-    records = []
-    for each in (never, always):
-        reset = jax.jit(jax.vmap(lambda k, m=each: mission.reset(k, m, models, NAIVE)))
-        roll = jax.jit(jax.vmap(lambda k, s, m=each: mission.rollout(k, m, models, s, 150)[1]))
-        records.append(roll(keys, reset(keys)))
-    for name in ("phase", "target", "scanned", "detected", "seen"):
-        np.testing.assert_array_equal(*(getattr(record, name) for record in records))
-    np.testing.assert_allclose(*(record.poses for record in records), atol=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +33,14 @@ def pushing(arena_of, set_robot):
 
 @pytest.fixture(scope="module")
 def move(team):
-    """`motion.move` of three missions; in the empty arena, the wheels pull `pull` times as much."""
+    """`rollout.move` of three missions; without contacts, wheels pull `pull` times as much."""
 
     @jax.jit
     def of_three(states, pull):
         model = team.free_arena.model
         model = model.replace(actuator_gainprm=pull * model.actuator_gainprm)
         weaker = replace(team, free_arena=replace(team.free_arena, model=model))
-        return motion.move(weaker, states)
+        return move_all(weaker, states)
 
     return lambda states, pull=1.0: of_three(states, jnp.float32(pull))
 
@@ -69,7 +54,7 @@ def way(before, after):
 def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
     free = mission.make_mission(CONFIG, contacts=False)
     ends, start = {}, pushing(0.002, 0.002, 0.002)
-    for name, each in (("contacts", move), ("free", jax.jit(lambda s: motion.move(free, s)))):
+    for name, each in (("contacts", move), ("free", jax.jit(lambda s: move_all(free, s)))):
         state = start
         for _ in range(5):
             state, _ = each(state)
@@ -79,16 +64,6 @@ def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
     # In half a second it drives 10 cm, but for the time it takes to start.
     assert np.all(ends["free"] > 0.08)
     assert np.all(ends["contacts"] < 0.01)
-
-
-@pytest.mark.slow
-def test_a_batch_moves_like_its_members(move, pushing):
-    gaps = 0.002, 0.5, 0.03
-    together, clearance = move(pushing(*gaps))
-    for i, gap in enumerate(gaps):
-        alone, expected = move(pushing(gap, gap, gap))
-        np.testing.assert_allclose(together.scene.poses[i], alone.scene.poses[0], atol=1e-6)
-        np.testing.assert_allclose(clearance[i], expected[0], atol=1e-6)
 
 
 @pytest.mark.slow

@@ -27,13 +27,6 @@ def test_wheel_speeds_are_those_worked_by_hand(command, left, right):
     np.testing.assert_allclose(speeds, [left, right], atol=1e-5)
 
 
-def test_wheel_speeds_drive_the_robot_as_commanded():
-    commands = jax.random.uniform(jax.random.key(0), (5, 3, 2), minval=-1.0)
-    left, right = np.moveaxis(np.array(navigation.wheel_speeds(commands)), -1, 0) * 0.05571 / 2
-    np.testing.assert_allclose((left + right) / 2, commands[..., 0], atol=1e-5)
-    np.testing.assert_allclose((right - left) / 0.069, commands[..., 1], atol=1e-5)
-
-
 def test_turning_takes_of_the_motors_what_the_robots_inertia_asks_for(arena):
     mj_data, inertia = mujoco.MjData(arena.mj_model), np.zeros((6, 6))
     mujoco.mj_forward(arena.mj_model, mj_data)
@@ -65,32 +58,6 @@ def test_turning_takes_of_the_motors_what_the_robots_inertia_asks_for(arena):
 def test_a_ramp_keeps_to_the_limits(command, wanted, seconds, expected):
     after = navigation.ramp(jnp.array(command), jnp.array(wanted), seconds)
     np.testing.assert_allclose(after, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("command", "wanted", "steps"),
-    [
-        ((0.0, 0.0), (0.2, 0.0), (8, 1)),  # 0.2 / 0.025 = 8
-        ((0.0, 0.0), (0.2, 1.0), (9, 32)),  # 0.2 / 0.02385 = 8.4, 1 / 0.032 = 31.25
-        ((0.2, -0.5), (-0.1, 0.2), (13, 22)),  # 0.3 / 0.02385 = 12.6, 0.7 / 0.032 = 21.9
-    ],
-)
-def test_a_ramp_reaches_the_wanted_command_in_time_and_stays(command, wanted, steps):
-    def step(command, _):
-        command = navigation.ramp(command, jnp.array(wanted), 0.01)
-        return command, command
-
-    _, commands = jax.lax.scan(step, jnp.array(command), length=40)
-    is_there = np.abs(np.array(commands) - wanted) < 1e-6
-    np.testing.assert_array_equal(np.argmax(is_there, axis=0) + 1, steps)
-    np.testing.assert_array_equal(is_there.sum(axis=0), 41 - np.array(steps))
-
-
-def test_a_ramp_takes_the_commands_of_all_robots_at_once():
-    commands, wanted = jnp.array([[0.0, 0.0], [0.2, 1.0]]), jnp.array([[0.2, 1.0], [-0.1, 1.0]])
-    after = navigation.ramp(commands, wanted, 0.01)
-    # As above: only the first one turns.
-    np.testing.assert_allclose(after, [[0.02385, 0.032], [0.175, 1.0]], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -40,23 +40,6 @@ def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_o
         assert decides(replace(values, novelty=STAYS_OLD), there).robots.view[0] == here
 
 
-def test_a_viewpoint_where_a_robot_stands_is_as_new_as_its_place(decides, models, arena_of):
-    close = Novelty(strength=jnp.full(2, 1.0), length=jnp.full(2, 0.01))
-    values = replace(with_values(models, [1.0, 0.0, 0.0, 0.0], [0.0] * 4), novelty=close)
-    state = arena_of(POSITIONS, POSES, policy=LATENT)
-
-    def view_from(place):
-        """The viewpoint that a robot chooses which has looked from where it stands."""
-        poses = state.scene.poses.at[0, :2].set(place)
-        there = replace(state, scene=replace(state.scene, poses=poses))
-        return int(decides(values, looked_from(place)(there)).robots.view[0])
-
-    nearest = view_from(POSES[0][:2])
-    place = state.roadmap.viewpoints[0, nearest]
-    assert view_from(place + jnp.array([0.0, 0.06])) == nearest
-    assert view_from(place + jnp.array([0.0, 0.04])) != nearest
-
-
 def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
     values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
     # No place is as far as 50 m from where the sensor has looked at PoI 0.
@@ -108,16 +91,6 @@ def test_where_all_new_viewpoints_are_taken_a_robot_makes_room_and_tries_again(
     for robots in (again, waits, left):
         assert not robots.exhausted.any()
         assert not robots.excluded[0].any()
-
-
-def test_an_auction_counts_the_way_to_where_a_look_is_new(decides, models, arena_of):
-    values = replace(with_values(models, [1.0, 1.0, 0.0, 0.0], [0.0] * 4), novelty=STAYS_OLD)
-    state = arena_of(POSITIONS, POSES, policy=LATENT)
-    # PoI 0 is straight ahead, PoI 1 a quarter turn away: 1.3 s.
-    assert decides(values, state, auctions=True).robots.target[0] == 0
-    # .59 m of driving, 2.9 s, before a look at PoI 0 is new.
-    again = looked_from([0.0, 0.0])(state)
-    assert decides(values, again, auctions=True).robots.target[0] == 1
 
 
 @pytest.mark.parametrize(

@@ -108,12 +108,3 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
     settings = replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
     single = replace(CONFIG, modalities=("camera",), jmvae=settings)
     assert list(mission.cases(single)) == list(POLICIES)
-
-
-def test_a_mission_of_another_size_is_named(team, models, arena_of):
-    scene = arena_of(POSITIONS, POSES).scene
-    with pytest.raises(ValueError, match="classes"):
-        mission.start(team, models, scene, jnp.zeros(4, int), 0, mission.no_faults(CONFIG))
-    faults = mission.Faults(jnp.zeros(3), jnp.zeros(2))
-    with pytest.raises(ValueError, match=r"faults\.stops_at"):
-        jax.eval_shape(lambda: mission.start(team, models, scene, jnp.zeros(3, int), 0, faults))

@@ -5,18 +5,15 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
-from teams import CONFIG, POLICIES
+from teams import CONFIG, POLICIES, decide_alone
 
-from jaxsense import dqn, evaluate, mission, train
+from jaxsense import evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
-from jaxsense.mission import choice, decide
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import output, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.sim import arena as arenas
 
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
@@ -52,7 +49,7 @@ def own(team):
 
 @pytest.fixture(scope="module")
 def decides(own, models):
-    return jax.jit(lambda state: decide.decide(jax.random.key(0), own, models, state, 0))
+    return jax.jit(lambda state: decide_alone(jax.random.key(0), own, models, state, 0))
 
 
 def test_a_policy_of_ones_own_chooses_pois(own, decides, arena_of):
@@ -85,60 +82,8 @@ def test_a_robot_whose_policy_has_no_value_fails(own, decides, arena_of):
     assert decides(state).robots.phase[0] == DRIVING
 
 
-def test_every_policy_of_the_table_is_played(own, decides, models, arena_of):
-    state = arena_of(POSITIONS, POSES)
-    state = replace(state, times_seen=jnp.array([[1, 0], [0, 1], [0, 0]], jnp.int32))
-    key, settings = jax.random.key(0), CONFIG.mission
-    assert [*own.policies] == [*POLICIES, *OWN]
-
-    @jax.jit
-    def choose_all(state):
-        known = decide.known_to(own, models, state, 0)
-        opinions = [choice.ask(key, policy, models, known) for policy in own.policies.values()]
-        return [choice.choose(settings, each, known) for each in opinions]
-
-    chosen = np.array(choose_all(state))
-    played = [decides(replace(state, policy=jnp.int32(i))) for i in range(len(chosen))]
-    np.testing.assert_array_equal([after.robots.target[0] for after in played], chosen)
-    assert len(set(chosen)) > 2
-
-
-def test_an_unknown_policy_is_refused(own):
-    with pytest.raises(
-        ConfigError, match=r"^policy = 'best': must be one of latent, network, gre.*, timed$"
-    ):
-        own.policy("best")
-
-
-def test_arenas_of_another_mission_are_reused(team, monkeypatch):
-    def build(*_args, **_settings):
-        raise AssertionError("compiles an arena")
-
-    monkeypatch.setattr(arenas, "build", build)
-    given = team.world.arena, team.free_arena
-    made = mission.make_mission(CONFIG, OWN, arenas=given)
-    assert (made.world.arena, made.free_arena) == given
-    with pytest.raises(AssertionError, match="compiles an arena"):
-        mission.make_mission(CONFIG)
-
-
 def playing(*names):
     return replace(CONFIG, mission=replace(CONFIG.mission, policies=names))
-
-
-def test_a_run_with_an_unknown_policy_is_refused():
-    mission.require_playable(playing("naive", "mine"), OWN)
-    expected = r"^mission.policies = \('naive', 'mine'\): must be among latent, "
-    with pytest.raises(ConfigError, match=expected):
-        mission.require_playable(playing("naive", "mine"))
-
-
-def test_a_policy_may_not_be_named_like_a_fault():
-    expected = "^policies = 'wall_stops': must not end in _alone, _stops, _blind$"
-    with pytest.raises(ConfigError, match=expected):
-        mission.require_playable(CONFIG, {"wall_stops": close})
-    with pytest.raises(ConfigError, match=expected):
-        mission.cases(CONFIG, (*POLICIES, "wall_stops"))
 
 
 @pytest.mark.parametrize(
@@ -155,14 +100,6 @@ def test_a_policy_may_not_be_named_like_a_fault():
 def test_the_name_of_a_policy_is_a_word_that_is_free(name, reason):
     with pytest.raises(ConfigError, match=rf"^policies = {name!r}: {reason}"):
         mission.require_playable(CONFIG, {name: close})
-
-
-def test_a_policy_may_not_replace_one_of_the_package(team):
-    arenas = team.world.arena, team.free_arena
-    with pytest.raises(ConfigError, match=r"^policies = 'naive': must not be latent, "):
-        mission.make_mission(CONFIG, {"naive": close}, arenas=arenas)
-    # The whole table may be given.
-    assert [*mission.make_mission(CONFIG, dqn.POLICIES, arenas=arenas).policies] == [*POLICIES]
 
 
 RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]
@@ -183,14 +120,6 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
         train.main(argv, policies=OWN)
     assert stop.value.code == output.INTERRUPTED
     assert given == [(("latent", "mine"), None, OWN)]
-
-
-def test_train_refuses_a_policy_that_it_is_not_given(tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        train.main([*RUN, "--out", str(tmp_path / "run"), "--cache", "None"])
-    line = "jaxsense.train: mission.policies = ('latent', 'mine'): must be among latent, network"
-    assert capsys.readouterr().err.startswith(line)
-    assert not (tmp_path / "run").exists()
 
 
 def test_own_policies_reach_the_programs_of_a_run(monkeypatch):

@@ -144,12 +144,6 @@ def test_naive_exploration_is_recorded_with_the_first_mission(split, play, team)
         np.testing.assert_allclose(played.metrics[name]["poses"][0], walk[-1], atol=1e-4)
 
 
-def test_without_room_or_naive_exploration_one_mission_is_recorded(play):
-    assert play(policies=("random", "naive"), batch=1, episodes=2).naive is None
-    assert play(policies=("random", "latent"), episodes=2).naive is None
-    assert play(policies=("naive", "random"), episodes=2).naive is None
-
-
 def test_events_of_a_mission_do_not_depend_on_when_it_is_played(play):
     """Missions 4 to 8 take the places of missions that are over."""
     poses = play().metrics["naive"]["poses"]

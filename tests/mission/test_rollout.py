@@ -4,19 +4,18 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from teams import CONFIG
 
 from jaxsense import mission
 from jaxsense.config import CONTROL_PERIOD
-from jaxsense.mission import act, navigation
-from jaxsense.mission.state import DRIVING, ENDED, FACING, FAILED, Faults
+from jaxsense.mission import act
+from jaxsense.mission.act import where_due
+from jaxsense.mission.state import ENDED, FAILED, Faults
 from jaxsense.sim import amiro
-from jaxsense.sim import arena as arenas
 
-LATENT, NAIVE = 0, 1
+NAIVE = 1
 STEPS, CHUNK = 240, 40
 NUM_POIS = CONFIG.arena.num_pois
 PERIOD = CONTROL_PERIOD
@@ -132,16 +131,6 @@ def test_every_robot_visits_every_poi_once_and_ends(healthy):
     assert np.all(end.robots.looks >= NUM_POIS)
 
 
-def test_nobody_touches_anything(healthy):
-    _, end, record = healthy
-    assert np.all(end.contacts == 0)
-    assert np.min(end.min_clearance) > 0.03
-    moving = record.time > 0
-    np.testing.assert_allclose(
-        np.where(moving, record.clearance, np.inf).min(axis=1), end.min_clearance, rtol=1e-6
-    )
-
-
 def test_limits_of_speed_and_acceleration_hold(healthy):
     _, _, record = healthy
     for commands in (record.command, record.wanted):
@@ -181,13 +170,6 @@ def test_the_map_changes_where_something_was_detected_and_nowhere_else(healthy):
     np.testing.assert_array_equal(changed, wrote[:, 1:])
     np.testing.assert_array_equal(end.version, record.detected.sum(axis=(1, 2)))
     assert np.all(np.diff(record.seen.astype(int), axis=1) >= 0)
-
-
-def test_one_robot_drives_while_another_one_scans(healthy):
-    _, _, record = healthy
-    phases = record.phase
-    apart = (phases[..., 0] == DRIVING) & (phases[..., 1] == FACING)
-    assert np.mean(apart.any(axis=1)) > 0.5
 
 
 def test_a_mission_that_is_over_stays_as_it_is(healthy):
@@ -237,67 +219,55 @@ def test_without_any_robot_the_mission_ends_at_once(played):
     assert np.all(end.robots.looks == 0)
 
 
-def test_same_keys_give_the_same_mission_and_the_policy_does_not_change_the_arena(reset):
-    keys, others = (jax.random.split(jax.random.key(n), TOGETHER) for n in (3, 4))
-    first, again = (reset(keys, NAIVE) for _ in range(2))
-    latent, other = reset(keys, LATENT), reset(others, 0)
-    jax.tree.map(np.testing.assert_array_equal, first, again)
-    jax.tree.map(np.testing.assert_array_equal, first.scene, latent.scene)
-    assert not np.any(first.scene.poses[:, 0] == other.scene.poses[:, 0])
+CALLS = []
 
 
-@pytest.fixture(scope="module")
-def driven(team, played, as_numpy):
-    """Physics of eight missions from 4 s on, with commands that go on towards the hardest.
-
-    The states, MuJoCo's data before the first step, and `[E, T, ...]` positions, velocities and
-    wheel speeds.
-    """
-    arena = team.world.arena
-    hardest = jnp.array([[amiro.MAX_SPEED, amiro.MAX_TURN_RATE], [-0.1, -amiro.MAX_TURN_RATE]])
-    recorded = jax.tree.map(lambda x: x[:8], played[1])
-
-    def drive(state):
-        data = arenas.place(arena, state.scene.layout, state.scene.poses)
-        data = data.replace(qvel=state.velocity.reshape(-1), qacc_warmstart=state.warmstart)
-
-        def substep(carry, _):
-            data, command = carry
-            command = navigation.ramp(command, hardest, arenas.TIMESTEP)
-            speeds = navigation.wheel_speeds(command)
-            data = arenas.drive(arena, data, speeds)
-            return (data, command), (data.qpos, data.qvel, speeds)
-
-        return data, jax.lax.scan(substep, (data, state.robots.command), length=20)[1]
-
-    before, after = jax.jit(jax.vmap(drive))(recorded)
-    return as_numpy((recorded, before, *after))
+def draw(given, kind):
+    keys, rows = given
+    jax.debug.callback(lambda kind: CALLS.append(int(kind)), kind)
+    return {"drawn": rows["x"] + jax.vmap(jax.random.uniform)(keys)}
 
 
-@pytest.mark.slow
-def test_a_physics_step_from_recorded_states_is_that_of_c_mujoco(team, driven):
-    arena = team.world.arena
-    recorded, before, qpos, qvel, speeds = driven
-    assert np.max(np.abs(recorded.velocity)) > 0.1  # some of them are driving
-    for e in range(8):
-        native = mujoco.MjData(arena.mj_model)
-        native.mocap_pos[:], native.mocap_quat[:] = before.mocap_pos[e], before.mocap_quat[e]
-        native.qpos[:], native.qvel[:] = before.qpos[e], before.qvel[e]
-        native.ctrl[:] = arenas.as_control(speeds[e, 0])
-        mujoco.mj_step(arena.mj_model, native)
-        np.testing.assert_allclose(qpos[e, 0], native.qpos, atol=1e-5)
-        np.testing.assert_allclose(qvel[e, 0], native.qvel, atol=1e-4)
+@pytest.mark.parametrize(("total", "share"), [(1, 1.0), (5, 0.0), (40, 0.6), (300, 0.1)])
+def test_rows_that_are_due_are_worked_out_and_the_others_stay(total, share):
+    rng = np.random.default_rng(total)
+    due = rng.random(total) < share
+    before, x = rng.normal(size=(2, total)).astype(np.float32)
+    keys = jax.random.split(jax.random.key(total), total)
+    find = jax.jit(
+        lambda due, before, keys, x: where_due(due, draw, {"drawn": before}, (keys, {"x": x}))
+    )
+    CALLS.clear()
+    found = find(due, before, keys, x)["drawn"]
+    jax.effects_barrier()
+    expected = np.where(due, x + jax.vmap(jax.random.uniform)(keys), before)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    size = min(total, max(8, total // 16))  # of a group
+    assert [0] * -(-due.sum() // size) == CALLS
 
 
-@pytest.mark.slow  # `ramp` and `drive` alone keep to them in other tests
-def test_limits_hold_at_every_physics_step(driven):
-    *_, qpos, qvel, speeds = driven
-    assert np.max(np.abs(speeds)) <= amiro.MAX_WHEEL_SPEED + 1e-4
-    velocity, yaw = qvel.reshape(8, 20, 2, 3), qpos.reshape(8, 20, 2, 3)[..., 2]
-    forward = velocity[..., 0] * np.cos(yaw) + velocity[..., 1] * np.sin(yaw)
-    change = np.abs(np.diff(forward, axis=1)) / arenas.TIMESTEP
-    turning = np.abs(np.diff(velocity[..., 2], axis=1)) / arenas.TIMESTEP
-    # A servo that follows a ramp changes no faster than the ramp; one part in fifty for Euler.
-    assert np.max(change) <= 1.02 * amiro.MAX_ACCELERATION
-    assert np.max(turning) <= 1.02 * amiro.MAX_TURN_ACCELERATION
-    assert np.max(change) > 0.5 * amiro.MAX_ACCELERATION
+def test_the_rows_of_a_group_are_of_one_kind():
+    rng = np.random.default_rng(0)
+    kinds, x = rng.integers(0, 5, 60), rng.normal(size=60).astype(np.float32)
+    due = (rng.random(60) < 0.7) & (kinds != 3)
+    CALLS.clear()
+
+    def times_kind(rows, kind):
+        jax.debug.callback(lambda kind: CALLS.append(int(kind)), kind)
+        branches = [lambda rows, k=k: k * rows for k in range(5)]
+        return jax.lax.switch(kind, branches, rows)
+
+    find = jax.jit(lambda due, x, kinds: where_due(due, times_kind, x, x, kinds))
+    found = find(due, x, kinds.astype(np.int32))
+    jax.effects_barrier()
+    np.testing.assert_allclose(found, np.where(due, kinds * x, x))
+    # In order, each in groups of 8; none of a kind of which no row is due.
+    numbers = [np.sum(due & (kinds == k)) for k in range(5)]
+    assert [k for k in range(5) for _ in range(-(-numbers[k] // 8))] == CALLS
+
+
+def test_under_vmap_each_batch_has_its_own_rows():
+    due = np.array([[True, False, False], [False, False, False], [True, True, True]])
+    x = jnp.arange(9.0).reshape(3, 3)
+    found = jax.vmap(lambda due, x: where_due(due, lambda x, _: -x, x, x))(due, x)
+    np.testing.assert_array_equal(found, np.where(due, -x, x))

@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from teams import CONFIG
 
 import jaxsense
 from jaxsense import dqn, mission
-from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.run import score
 
@@ -87,36 +85,6 @@ def test_differences_are_of_the_same_arenas(play):
     ]
 
 
-@pytest.mark.parametrize(
-    ("policies", "options", "expected"),
-    [
-        ({"mine": 3}, {}, r"^policies = 'mine': must be a function or a dqn.Policy$"),
-        ({"naive": last_first}, {}, r"^policies = 'naive': must not be latent, "),
-        (
-            {"mine": last_first},
-            {"against": ["best"]},
-            r"^against = \['best'\]: must be a list of one or more",
-        ),
-        (
-            {"mine": last_first},
-            {"against": []},
-            r"^against = \[\]: must be a list of one or more of latent",
-        ),
-        ({"mine": last_first}, {"episodes": 0}, r"^episodes = 0: must be"),
-        ({"mine": last_first}, {"seed": -1}, r"^seed = -1: must be a whole number from 0 to"),
-    ],
-)
-def test_a_wrong_argument_is_named(play, policies, options, expected):
-    with pytest.raises(ValueError, match=expected):
-        play(policies, **options)
-
-
-def test_models_of_another_number_of_pois_are_refused(models):
-    config, _ = jaxsense.load_pretrained("many")
-    with pytest.raises(ConfigError, match=r"^arena.num_pois = 8: must be the number of PoIs"):
-        jaxsense.score_missions(config, models, {"mine": last_first})
-
-
 @pytest.mark.parametrize("values", [jnp.zeros(3), jnp.zeros(4, int), 0.0])
 def test_a_policy_without_a_value_for_each_action_is_named(values):
     checked = score._checked("mine", Policy(lambda key, models, known: values, is_unordered=True))
@@ -125,14 +93,3 @@ def test_a_policy_without_a_value_for_each_action_is_named(values):
         ValueError, match=r"^policies\['mine'\] = <lambda>: must return floats of shape \[4\]"
     ):
         checked.values(None, None, SimpleNamespace(looks=np.zeros((3, 2))))
-
-
-def test_a_policy_of_a_task_and_one_in_numpy_are_named():
-    expected = r"^policies\['mine'\] = .*: must be a function \(key, models, known\) -> values that"
-    with pytest.raises(ConfigError, match=expected):
-        score._checked("mine", lambda key, observation: 0)
-    in_numpy = score._checked("mine", lambda key, models, known: np.asarray(known.looks[:, 0]))
-    with pytest.raises(ConfigError, match=expected):
-        jax.eval_shape(
-            lambda x: in_numpy.values(None, None, SimpleNamespace(looks=x)), np.zeros((3, 2))
-        )

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxsense
 from jaxsense import mission, sim
 from jaxsense.config import ArenaConfig, Config
 from jaxsense.core.types import Belief
@@ -73,3 +74,13 @@ def test_the_map_starts_from_the_prior_of_the_fusion(team, models):
         belief = begin(jax.random.key(0), each)
         np.testing.assert_allclose(belief.mean, [mean] * 3)
         np.testing.assert_allclose(belief.std, [std] * 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("preset", ["smoke", "team"])
+def test_a_mission_begins_without_weak_types(preset):
+    # JAX would compile a second program after a step.
+    config, key = jaxsense.PRESETS[preset], jax.random.key(0)
+    given = mission.make_mission(config), jaxsense.init(key, config)
+    state = jax.eval_shape(lambda: mission.reset(key, *given))
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    assert not [jax.tree_util.keystr(path) for path, leaf in leaves if leaf.weak_type]

@@ -40,14 +40,6 @@ def test_a_network_reads_from_an_observation_what_it_learns_from(name):
         assert set(np.unique(features[:, -3])) == {0.0, 1.0}
 
 
-@pytest.mark.slow
-def test_robots_of_a_team_learn_in_the_teams_of_the_task():
-    task = make("team-v0")
-    state = jax.jit(task.learning(task.models.agent).reset)(jax.random.key(0)).now
-    np.testing.assert_array_equal(state.team.modality, task.robots)
-    assert state.team.works.all()
-
-
 def test_scaling_is_inverted():
     scaling = Scaling(jnp.array([1.0, -2.0]), jnp.array([0.5, 4.0]))
     features = jnp.array([[0.5, 2.0], [2.0, -6.0]])
@@ -92,10 +84,3 @@ def test_policies_of_one_kind_are_compiled_once():
     alone = [tasks.mean_return(key, task, functools.partial(above, -20.0), 32) for key in keys]
     assert alone[0] == pytest.approx(found[0], abs=1e-5)
     assert len(set(alone)) == 3
-
-
-@pytest.mark.slow
-def test_policies_that_are_no_pytrees_of_numbers_are_played():
-    """As a module of another library, whose activation function is a leaf."""
-    policy = Partial(lambda choose, nop, key, seen: choose(nop), lambda x: x, jnp.int32(3))
-    assert tasks.mean_return(jax.random.key(0), make("map-v0"), policy, 4) == 0.0

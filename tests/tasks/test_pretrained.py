@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,8 @@ import pytest
 
 import jaxsense
 from jaxsense import tasks
-from jaxsense.config import ConfigError
+from jaxsense.core.types import Belief
+from jaxsense.tasks import pretrained
 
 
 def with_sizes_of(config, other):
@@ -56,17 +58,6 @@ def test_models_tell_classes_apart(preset):
     assert correct(looks) > least
 
 
-def test_unknown_models_are_refused():
-    with pytest.raises(ConfigError, match="preset = 'smoke': must be one of default, noisy"):
-        jaxsense.load_pretrained("smoke")
-    with pytest.raises(ConfigError, match=r"name = 'x': must be one of default, .*noisy-v0"):
-        tasks.origin("x")
-
-
-def test_a_task_tells_its_origin():
-    assert tasks.origin("noisy-v0").command.startswith("python -m ")
-
-
 @pytest.mark.slow
 def test_a_training_repeats_the_models_that_travel(tmp_path):
     from jaxsense import train
@@ -83,3 +74,15 @@ def test_a_training_repeats_the_models_that_travel(tmp_path):
         # other side: 37 of 2,016 since the parameters of detectors are drawn with a key of their
         # own. With another seed a quarter and more differ.
         assert np.mean(np.abs(one.q - other.q) > 0.05) < 0.025
+
+
+def test_what_was_written_is_read_again(tmp_path):
+    tree = {"beliefs": (Belief(jnp.arange(3.0), jnp.ones(3)), [jnp.int32(7)]), "none": ()}
+    config, made = jaxsense.PRESETS["smoke"], tasks.origin("default")
+    pretrained.write_trees(tmp_path / "a.npz", {"tree": tree}, config, made)
+    arrays, *about = pretrained.read(tmp_path / "a.npz")
+    assert about == [config, made]
+    chex.assert_trees_all_equal(pretrained.fill(arrays, "tree", tree), tree)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+    with pytest.raises(ValueError, match="tree/x is missing"):
+        pretrained.fill(arrays, "tree", {"x": jnp.zeros(2)})

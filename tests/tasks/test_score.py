@@ -1,7 +1,6 @@
 """Scores of policies in frozen tasks."""
 
 import dataclasses
-import importlib
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,7 @@ import jaxsense
 from jaxsense import dqn, tasks
 from jaxsense.config import ConfigError
 from jaxsense.tasks import registry
-from jaxsense.tasks.task import EPISODES, MapTask
+from jaxsense.tasks.task import MapTask
 
 NAME = "map-v0"
 
@@ -36,27 +35,6 @@ def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
     assert known.low < of_uniform.mean_return.value < known.high
     assert of_uniform.has_optimum
     assert of_uniform.best == "optimal"
-
-
-def test_no_look_earns_nothing():
-    found = jaxsense.score(NAME, nop)
-    np.testing.assert_array_equal(found.returns, 0)
-    assert found.fraction_of_optimal == tasks.Estimate(0, 0, 0)
-
-
-def test_a_policy_on_the_host_plays_the_same_episodes():
-    def first_unknown(observation):
-        # The belief of an unseen PoI is the widest.
-        return jnp.where(observation[2::4].max() > 1.5, observation[2::4].argmax(), 3)
-
-    def on_host(observations):
-        widths = observations[:, 2::4]
-        return np.where(widths.max(axis=1) > 1.5, widths.argmax(axis=1), 3)
-
-    one = jaxsense.score(NAME, [lambda key, seen: first_unknown(seen)])
-    other = jaxsense.score(NAME, [tasks.on_host(on_host)])
-    np.testing.assert_allclose(one.returns, other.returns)
-    assert one.mean_return.value > 0
 
 
 def optimum_of_eight():
@@ -114,26 +92,6 @@ def test_a_task_with_a_name_of_its_own_is_compared_in_itself(monkeypatch):
     assert 0 < found.references["optimal"][0] < 0.9 * task.returns[0, 0]
 
 
-@pytest.mark.slow
-def test_a_policy_that_remembers_looks_at_each_poi_once():
-    def act(key, memory, observation):
-        return memory, memory + 1
-
-    naive = tasks.Recurrent(act, jnp.int32(0))
-    found = jaxsense.score(NAME, [naive])
-    # As naive exploration, which however leaves out what it has seen before the episode.
-    assert found.fraction_of_optimal.high < 1
-    assert (found.returns < found.references["naive"]).all()
-    assert (found.returns > found.references["random"]).all()
-
-
-@pytest.mark.slow
-def test_policies_of_several_trainings_play_a_seed_each(of_uniform):
-    found = jaxsense.score(NAME, [uniform, nop])
-    np.testing.assert_allclose(found.returns, [of_uniform.returns[0], 0.0], rtol=1e-6)
-    np.testing.assert_array_equal(found.references["optimal"], of_uniform.references["optimal"][:2])
-
-
 @pytest.mark.parametrize("library", [np, jnp])
 def test_a_policy_on_the_host_may_use_jax_and_write_into_its_observations(library):
     def first_unknown(observations):
@@ -144,14 +102,6 @@ def test_a_policy_on_the_host_may_use_jax_and_write_into_its_observations(librar
     assert jaxsense.score(NAME, [tasks.on_host(first_unknown)]).mean_return.value > 0
 
 
-@pytest.mark.slow
-def test_references_are_played_where_they_are_not_stored():
-    stored = jaxsense.score(NAME, nop).references["naive"][0]
-    fewer = jaxsense.score(NAME, [nop], episodes=64).references["naive"][0]
-    assert fewer != stored
-    assert abs(fewer - stored) < 1
-
-
 def test_the_interval_is_of_the_interquartile_mean():
     # The middle half of 1, 2, 3, 100: 2.5.
     found = tasks.estimate(np.array([3.0, 100.0, 1.0, 2.0]))
@@ -160,61 +110,12 @@ def test_the_interval_is_of_the_interquartile_mean():
     assert tasks.estimate(np.array([4.0])) == tasks.Estimate(4.0, 4.0, 4.0)
 
 
-def test_a_team_is_measured_against_its_best_rule():
-    references = {"nearest": np.array([2.0, 4.0]), "naive": np.array([1.0, 2.0])}
-    found = tasks.Score("team-v0", "team", np.array([2.0, 2.0]), references, False)
-    assert found.best == "nearest"
-    assert found.fraction_of_optimal.value == 0.75
-    assert "best rule, nearest" in str(found)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            (NAME, lambda key, seen: seen[0]),
-            r"policy = <lambda>: must return an integer of shape \[\]; not float32\[\]",
-        ),
-        (
-            (NAME, lambda key, seen: jnp.int32(7)),
-            r"policy = <lambda>: must return actions from 0 to 3",
-        ),
-        ((NAME, []), r"policy = \[\]: must be one policy or several"),
-        (("noisy-v1", nop), r"task = 'noisy-v1': must be from make, or one of"),
-    ],
-)
-def test_wrong_policies_and_names_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        jaxsense.score(*arguments, episodes=2)
-
-
-def test_all_policies_are_checked_before_one_is_compiled(monkeypatch):
-    def scalar(key, observation):
-        return observation[0]
-
-    # The package's function hides the module.
-    monkeypatch.setattr(importlib.import_module("jaxsense.tasks.score"), "_player", pytest.fail)
-    with pytest.raises(ConfigError, match="policy = scalar: must return an integer"):
-        jaxsense.score(NAME, [nop, scalar])
-
-
-def test_memory_may_start_as_a_python_number():
-    policy = tasks.Recurrent(lambda key, memory, seen: (jnp.int32(3), memory + 0.5), 0)
-    np.testing.assert_array_equal(jaxsense.score(NAME, [policy]).returns, 0)
-
-
 def test_actions_from_the_host_stay_integers():
     def turns_real(observations):
         return np.full(len(observations), 2.7 if observations.any() else 2)
 
     with pytest.raises(jax.errors.JaxRuntimeError, match="act = turns_real: must return"):
         jaxsense.score(NAME, [tasks.on_host(turns_real)], episodes=1)
-
-
-def test_an_agent_goes_with_a_name():
-    with pytest.raises(ConfigError, match="agent = 'lidar': must be None with a task"):
-        jaxsense.score(jaxsense.make(NAME), nop, agent="lidar")
-    assert EPISODES > 1
 
 
 @pytest.mark.parametrize(
