@@ -130,8 +130,11 @@ def test_the_way_of_looking_is_an_argument_of_jit_too(models):
     mdp = looks.make_mdp(CONFIG, models)
     assert isinstance(mdp.looks, Live)
     scene = scene_of(mdp, jax.random.key(0), jnp.array([0, 1, 2]))
-    other = looks.make_mdp(CONFIG, jaxsense.init(jax.random.key(1), CONFIG))
-    other = replace(other, looks=replace(mdp.looks, detectors=other.looks.detectors))
+    # An untrained detector is sure, one without weights is not.
+    blank = tuple(
+        replace(x, params=jax.tree.map(jnp.zeros_like, x.params)) for x in models.detectors
+    )
+    other = replace(mdp, looks=replace(mdp.looks, detectors=blank))
     assert np.all(look(mdp, scene) != look(other, scene))
 
 
