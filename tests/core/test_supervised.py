@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxsense.core import supervised
 
@@ -83,16 +82,6 @@ def test_the_last_chunk_makes_no_step_too_many():
     np.testing.assert_allclose(states[3].loss, losses[0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("steps", [6, 5])
-def test_adam_comes_to_rest_at_the_last_step(steps):
-    problem = Given(square, [3.0] * 3, steps)
-    state = start(jnp.float32(0), problem)
-    for _ in range(2):
-        state, _ = fit(state, problem)
-    after, _ = fit(state, problem)
-    assert after.params == state.params
-
-
 def test_the_loss_receives_the_step_counted_from_the_start():
     problem = Given(lambda params, batch, step: step.astype(jnp.float32), [0.0] * 3, 6)
     state, counted = start(jnp.float32(0), problem), []
@@ -100,18 +89,6 @@ def test_the_loss_receives_the_step_counted_from_the_start():
         state, steps = fit(state, problem)
         counted.extend(steps.tolist())
     assert counted == [0, 1, 2, 3, 4, 5]
-
-
-def test_the_last_loss_tells_of_parameters_that_are_not_finite():
-    # sqrt(p) at p = 0 is 0, and its slope infinite.
-    def loss(params, batch, step):
-        return jnp.sqrt(params["p"]) + params["q"]
-
-    for is_finite in ([False], [True, False]):
-        problem = Given(loss, [0.0] * len(is_finite), 10)
-        state, losses = fit(start({"p": jnp.float32(0), "q": jnp.float32(0)}, problem), problem)
-        np.testing.assert_array_equal(np.isfinite(losses), is_finite)
-        assert np.isnan(state.loss)
 
 
 def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_left():

@@ -100,31 +100,3 @@ def test_every_situation_is_drawn(looks, robot):
     assert (view.distance[gone] <= far).all()
     assert (view.distance == before.distance)[~gone].all()
     assert (np.abs(view.bearing) <= np.radians((40.0, 120.0)[robot])).all()
-
-
-def test_the_twin_of_a_robot_is_seen_and_its_own_body_is_not():
-    simulation = world.make_world(CONFIG)
-    scene = jax.jit(lambda key: world.random_scene(key, simulation, jnp.array([0, 1, 2])))
-    scene = scene(jax.random.key(0))
-    layout = dataclasses.replace(
-        scene.layout, position=jnp.tile(absence.outside(CONFIG.arena), (3, 1))
-    )
-    poses = jnp.array([[-1.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
-    lidar = dataclasses.replace(
-        simulation.sensors[LIDAR],
-        config=dataclasses.replace(CONFIG.lidar, range_noise=0.0),
-    )
-
-    @jax.jit
-    def scan(twin):
-        data = arenas.place(simulation.arena, layout, poses)
-        ahead = jnp.array([[1.0], [0.0]])
-        arena, light = simulation.arena, scene.light
-        return sim.scan(
-            jax.random.key(0), lidar, arena, data, layout, light, LIDAR, ahead, twin=twin
-        )
-
-    # Half a metre ahead, less half of the LiDAR's 50 mm; else the wall.
-    np.testing.assert_allclose(scan(jnp.array([0.5, 0.0])), [0.475], atol=1e-5)
-    np.testing.assert_allclose(scan(jnp.array([0.0, 0.5])), [1.5], atol=1e-5)
-    np.testing.assert_allclose(scan(jnp.array(absence.outside(CONFIG.arena))), [1.5], atol=1e-5)

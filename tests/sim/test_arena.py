@@ -1,4 +1,3 @@
-import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -206,25 +205,6 @@ def test_as_many_pois_as_the_config_accepts_can_be_placed():
     found = sorted(map(tuple, np.round(np.array(layout.position), 5).tolist()))
     middles = [-0.4, -0.2, 0.0, 0.2, 0.4]
     np.testing.assert_allclose(found, [(x, y) for x in middles for y in middles], atol=1e-5)
-
-
-def test_new_layouts_and_classes_do_not_retrace(arena):
-    chex.clear_trace_counter()
-
-    @jax.jit
-    @chex.assert_max_traces(n=1)
-    def look_around(key, classes, poses):
-        data = sim.place(arena, sim.random_layout(key, ArenaConfig(), classes), poses)
-        section = sim.cross_section(arena, data, 0.1, 0)
-        angles = jnp.linspace(-3.0, 3.0, 16)
-        return jax.vmap(sim.cast, in_axes=(None, None, 0))(section, poses[0, :2], angles).distance
-
-    seen = [
-        look_around(jax.random.key(seed), jnp.array(classes), jnp.full((2, 3), 0.1 * seed))
-        for seed, classes in enumerate([(0, 1, 2), (2, 2, 2), (0, 0, 1)])
-    ]
-    assert look_around._cache_size() == 1
-    assert not np.allclose(seen[0], seen[1])
 
 
 FAR = [[-0.8, 0.8], [-0.8, -0.8], [0.8, -0.8]]

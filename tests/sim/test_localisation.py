@@ -52,13 +52,6 @@ def test_a_robot_heads_for_where_its_error_leads(pose, error, expected):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_without_an_error_positions_stay_to_the_last_bit():
-    position, pose = jax.random.normal(jax.random.key(0), (2, 1000, 3))
-    aim = jax.jit(jax.vmap(localisation.aimed_at))
-    found = aim(position[:, :2], pose, jnp.zeros((1000, 3)))
-    np.testing.assert_array_equal(found, position[:, :2])
-
-
 @pytest.fixture(scope="module")
 def simulation():
     return world.make_world(PRESETS["smoke"])
@@ -81,33 +74,3 @@ def test_training_looks_have_the_bearing_and_distance_of_a_misplaced_robot(simul
     assert np.mean(bearing) == pytest.approx(0.1, abs=0.002)
     assert np.std(distance) == pytest.approx(0.01, rel=0.02)
     assert np.mean(distance) == pytest.approx(0.5, abs=0.001)
-
-
-@pytest.mark.slow
-def test_surveys_expect_pois_where_misplaced_robots_do(simulation):
-    classes, keys = jnp.array([0, 1, 2]), jax.random.split(jax.random.key(0), 64)
-
-    @jax.jit
-    def survey(errors):
-        misplaced = replace(simulation, localisation=errors)
-        scenes, windows, distances = jax.vmap(lambda key: world.survey(key, misplaced, classes))(
-            keys
-        )
-        return scenes.poses, windows[1], distances
-
-    poses, windows, distances = survey(None)
-    same, others, apart = survey(LocalisationConfig(error=(0.05, 0.0)))
-    np.testing.assert_array_equal(poses, same)
-    assert np.std(apart - distances) == pytest.approx(0.05, rel=0.15)
-    assert np.any(windows != others)
-    _, turned, exact = survey(LocalisationConfig(error=(0.0, 5.0)))
-    np.testing.assert_allclose(exact, distances, atol=1e-6)
-    assert np.any(windows != turned)
-
-
-def test_training_has_the_errors_only_where_the_settings_say_so(simulation):
-    assert simulation.localisation is None
-    config, errors = PRESETS["smoke"], LocalisationConfig(in_training=True, error=(0.0, 3.0))
-    mission = replace(config.mission, localisation=errors)
-    made = world.make_world(replace(config, mission=mission), arena=simulation.arena)
-    assert made.localisation == errors

@@ -10,7 +10,6 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import ArenaConfig, Attribute, Shape
-from jaxsense.mission import navigation
 from jaxsense.sim import sensors, windows
 
 LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
@@ -55,16 +54,6 @@ def test_rays_meet_shapes_where_their_sides_are(view):
         assert hit.distance == pytest.approx(distance, abs=1e-5)
 
 
-def test_clearance_is_that_of_the_shape(view):
-    # 0.5 m from each centre along x, less half the side of the slab or the post, and the robot.
-    for place, half in (((0.5, 0.0, 0.0), 0.1), ((0.5, 1.0, 0.0), 0.05)):
-        found = navigation.clearance(CONFIG, LAYOUT, jnp.array([place]))
-        wall = 1.5 - max(place[:2])
-        np.testing.assert_allclose(found, [min(0.5 - half, wall) - 0.0495], atol=1e-6)
-    found = navigation.clearance(CONFIG, LAYOUT, jnp.array([[0.0, -0.5, 0.0]]))
-    np.testing.assert_allclose(found, [0.5 - 0.06 - 0.0495], atol=1e-6)
-
-
 def test_surfaces_show_the_attributes_of_pois_and_of_everything_else(view):
     arena, _ = view
     shown = sensors.surfaces(arena, LAYOUT)
@@ -82,25 +71,6 @@ class ThreeRays:
 
     def centre(self, bearing):
         return 1.0 - 2.0 * bearing
-
-
-class Clock(sim.Sensor):
-    """Where and when it looks, instead of what it sees."""
-
-    def read(self, key, hits, surfaces, light):
-        return light.point
-
-
-@pytest.mark.slow
-def test_a_scan_tells_the_sensor_where_and_when_it_looks(view):
-    arena, data = view
-    clock = Clock(height=0.05, rays=ThreeRays(), window=3)
-    for seconds in (0.0, jnp.float32(2.5)):
-        found = sim.scan(
-            jax.random.key(0), clock, arena, data, LAYOUT, LIGHT, 0, clock.directions, seconds
-        )
-        np.testing.assert_array_equal(found, [*sim.robot_poses(data)[0, :2], seconds])
-    assert LIGHT.point is None
 
 
 class Sonar(sim.Sensor):

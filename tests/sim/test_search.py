@@ -85,24 +85,8 @@ def test_a_search_is_as_wide_as_its_errors_explain():
         )
 
 
-@BOTH
-def test_errors_smaller_than_a_ray_leave_the_nearest_window(sensor):
-    errors = Search(heading=1e-3)
-    found = searching(sensor.name, errors)(readings_of(sensor), 0.013, 1.0)
-    is_tried = np.isfinite(found.log_prior).all(axis=0)
-    np.testing.assert_array_equal(is_tried, np.arange(len(is_tried)) == len(is_tried) // 2)
-
-
 def readings_of(sensor):
     """A scan in which every reading tells its ray, below the limit of a window."""
     number = len(sensor.angles) * sensor.channels
     shape = (len(sensor.angles), *(() if sensor.channels == 1 else (sensor.channels,)))
     return np.linspace(0.1, 0.9, number, dtype=np.float32).reshape(shape)
-
-
-def test_small_errors_of_position_try_other_distances_too():
-    sensor = sensors.make(PRESETS["default"])[1]
-    given = Search(position=0.01)
-    window = jnp.ones(search.widened(sensor, given).window)
-    found = search.candidates(sensor, given, window, jnp.float32(0), jnp.float32(1))
-    np.testing.assert_allclose(found.distances, [0.99, 1.0, 1.01], rtol=1e-6)

@@ -1,6 +1,3 @@
-import dataclasses
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -171,39 +168,9 @@ def test_first_beam_is_on_the_right(scans, known_layout):
     assert ranges[341 + 255] == pytest.approx(2.5, abs=1e-3)
 
 
-def test_rays_of_a_window_read_what_they_do_in_a_full_scan(
-    arena, place, noiseless, view, known_layout
-):
-    data = place(known_layout, FACE_TO_FACE)
-
-    def look(robot, sensor, bearing):
-        rays, key = windows.rays_of(sensor, bearing), jax.random.key(3)
-        return sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, rays)
-
-    @jax.jit
-    def looks(bearing):
-        return [look(robot, sensor, bearing) for robot, sensor in enumerate(noiseless)]
-
-    for bearing in (-0.3, 0.05):
-        of_robots = looks(jnp.float32(bearing))
-        for sensor, readings, full in zip(noiseless, of_robots, view, strict=True):
-            np.testing.assert_allclose(readings, windows.around(sensor, full, bearing), atol=1e-5)
-
-
 def indices(sensor, bearing):
     """Of the rays of a window."""
     return np.asarray(windows.around(sensor, np.arange(len(sensor.angles)), bearing), int)
-
-
-def test_windows_are_centred_on_the_bearing(noiseless):
-    for sensor in noiseless:
-        rays = indices(sensor, 0.2)
-        assert rays.shape == (sensor.window,)
-        np.testing.assert_array_equal(np.diff(rays), sensor.stride)
-        # Between the two rays in its middle, 0.2 rad, to within half a ray.
-        middle = sensor.angles[rays[[0, -1]]]
-        middle = np.arctan(np.tan(middle).mean()) if sensor.name == "camera" else middle.mean()
-        assert middle == pytest.approx(0.2, abs=0.004)
 
 
 def test_windows_stop_at_the_edges(noiseless):
@@ -230,24 +197,3 @@ def test_a_robot_does_not_see_itself_but_sees_the_other(scans, known_layout):
     # Its body's colour is (0.25, 0.25, 0.3), and it faces +x: 0.65 of that.
     np.testing.assert_allclose(pixels[320], 0.65 * np.array([0.25, 0.25, 0.3]), atol=1e-4)
     assert ranges[341] == pytest.approx(1.5 + 0.9, abs=1e-4)
-
-
-def test_a_traced_robot_sees_what_a_static_one_does(arena, place, noiseless, known_layout):
-    data = place(known_layout, FACE_TO_FACE)
-
-    def scan(robot, modality):
-        sensor, key = noiseless[modality], jax.random.key(0)
-        rays = jnp.array(sensor.directions)
-        return sim.scan(key, sensor, arena, data, known_layout, LIGHT, robot, rays)
-
-    for modality in (0, 1):
-        traced = jax.jit(functools.partial(scan, modality=modality))
-        for robot in (0, 1):
-            expected = jax.jit(functools.partial(scan, robot, modality))()
-            np.testing.assert_allclose(traced(robot), expected, atol=1e-6)
-
-
-def test_make_follows_the_order_of_the_modalities():
-    config = dataclasses.replace(Config(), modalities=("lidar", "camera"))
-    assert [s.name for s in sensors.make(config)] == ["lidar", "camera"]
-    assert [s.height for s in sensors.make(config)] == [0.152, 0.042]

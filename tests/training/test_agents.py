@@ -1,8 +1,6 @@
 """Stages of agents: the values of looks, Q-learning and tours."""
 
 import dataclasses
-import sys
-import types
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, TINY, inputs_of, sources_of, stage_of
+from tiny import KEY, TINY, inputs_of, stage_of
 
 from jaxsense import models
 from jaxsense.config import MdpConfig, TeamConfig, ToursConfig
-from jaxsense.core.types import Belief, pytree
+from jaxsense.core.types import Belief
 from jaxsense.dqn import training as dqn
 from jaxsense.training import comparison
 from jaxsense.training.detections import Detections
@@ -28,27 +26,8 @@ def detections_of(bank, held_out: Any = (), starts: Any = ()) -> Detections:
     return Detections(bank, held_out, starts, nothing)
 
 
-@pytree
-class Confident:
-    """Rewards the probability of the most likely class that a look adds."""
-
-    look_cost: Any
-    is_of_labels = False
-
-    def information(self, belief, probabilities):
-        return probabilities.max()
-
-    def of_gain(self, gain):
-        return gain - self.look_cost
-
-
-@pytest.mark.parametrize(
-    "reward", ["nats", "own_rewards:confident", pytest.param("paper", marks=pytest.mark.slow)]
-)
-def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward, monkeypatch):
-    module = types.ModuleType("own_rewards")
-    module.confident = lambda config: Confident(config.look_cost)  # pyright: ignore
-    monkeypatch.setitem(sys.modules, "own_rewards", module)
+@pytest.mark.parametrize("reward", ["nats", pytest.param("paper", marks=pytest.mark.slow)])
+def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(reward):
     mdp = MdpConfig(reward=reward, look_cost=0.125, min_increase=0.01)
     fusion = dataclasses.replace(TINY.jmvae, fusion="filter", latent_size=1)
     config = dataclasses.replace(TINY, jmvae=fusion, mdp=mdp)
@@ -66,9 +45,6 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward(r
     if reward == "nats":
         # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
         expected = first = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
-    elif reward == "own_rewards:confident":
-        # 1 / 3 before; 1 after a green one, and 1 / 2 after each of two red ones.
-        expected = first = [1 / 3 + 2 / 3 / 2 - 1 / 3 - 0.125, -0.125]
     else:
         # Before, a variance of 1 + that of the three means. After a green one 1, and after a red
         # one 1 + 12 / 4 = 4.
@@ -125,12 +101,6 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     np.testing.assert_array_equal(progress.metrics["evaluation"], [np.nan, 3.0])
 
 
-def test_the_network_of_a_team_is_evaluated_with_its_first_sensor():
-    team = dataclasses.replace(BANK, dqn=dataclasses.replace(BANK.dqn, task="team"))
-    # As its curve is titled, beside the optimum of that sensor, see `learning_plots.rewards`.
-    assert sources_of(team)["dqn_team"]["modality"] == 0
-
-
 TOURS = dataclasses.replace(
     TINY,
     dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
@@ -144,36 +114,3 @@ def test_there_is_room_for_trials_in_all_states_with_the_most_pois():
     assert trials.is_tried.shape == trials.seconds.shape == (3, 28)
     # 2 x 2 + 3 x 2 + 4 = 14 numbers of each PoI.
     assert trials.observation.shape == (3 * 14, 28)
-
-
-@pytest.mark.slow  # compiles trials of the auction, with the map's readout
-def test_a_team_learns_its_tours_from_all_trials_so_far():
-    config = TOURS
-    untrained = models.init(KEY, config)
-    bank = tuple(jnp.ones((3, 4, n)) / n for n in models.make_jmvae(config).feature_sizes)
-    # The first look at a PoI pays, and no other.
-    values = tuple(
-        dataclasses.replace(v, one_step_unseen=jnp.ones(())) for v in untrained.look_values
-    )
-    inputs = {
-        "look_values": values, "fusion": untrained.fusion, "detections": detections_of(bank)
-    }  # fmt: skip
-    stage = stage_of("tours", config)
-    state = stage.begin(KEY, config, **inputs)
-    first = state[0].params
-    advance = jax.jit(lambda key, state: stage.advance(key, config, state, **inputs))
-    # 41 steps are 14 chunks of 3, the last of which has 2; 20 states are 2 in each chunk.
-    written = []
-    for key in stage.chunk_keys(KEY):
-        state, progress = advance(key, state)
-        assert np.isfinite(progress.loss).all()
-        written.append(np.asarray(state[1].observation))
-    assert len(written) == 14
-    for i, observed in enumerate(written):
-        assert np.any(observed[:, : 2 * i + 2], axis=0).all()
-        assert not np.any(observed[:, 2 * i + 2 :])
-        np.testing.assert_array_equal(observed[:, : 2 * i + 2], written[-1][:, : 2 * i + 2])
-    assert int(state[0].step) == 41
-    assert state[1].is_tried.sum(axis=0).max() == 2
-    learned = stage.finish(config, state, **inputs)
-    assert any(np.any(x != y) for x, y in zip(*map(jax.tree.leaves, (first, learned)), strict=True))

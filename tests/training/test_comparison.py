@@ -8,16 +8,13 @@ import numpy as np
 import pytest
 from by_hand import CONFIG, EXACT, KEY, detections, in_place
 
-import jaxsense
 from jaxsense.config import EvaluationConfig
-from jaxsense.dqn import map_mdp, optimum, policies
+from jaxsense.dqn import optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.models import make_jmvae, make_prior
 from jaxsense.training import comparison
 from jaxsense.training.comparison import held_out_mdp, models_of
 from jaxsense.vae import filter
-
-NUM_STATES = 1728  # 3^3 x 2^6
 
 
 def with_bias(bias):
@@ -51,31 +48,6 @@ def play(modality, models, bank):
 
 # Every look of the camera pays until it has looked, by `optimal`.
 PAYS = constant(1.0, 1.0)
-
-
-@pytest.mark.slow
-def test_policies_are_played_from_every_state_and_from_random_starts():
-    # Where a look replaces the one before, the values of looks do not matter.
-    models = models_with(jnp.array([0.0, 0.0, 0.0, 1.0]), (PAYS, PAYS))
-    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
-    of = {name: total for name, (total, _) in found.items()}
-    assert {x.shape for pair in found.values() for x in pair} == {(NUM_STATES + 16,)}
-    assert set(of) == {"latent", "optimal", "greedy", "naive", "random"}
-    np.testing.assert_array_equal(of["latent"], 0.0)  # always NOP
-    # The means over all states; a policy is at best as good.
-    optimal, naive, uniform = (
-        of[name][:NUM_STATES].mean() for name in ("optimal", "naive", "random")
-    )
-    assert optimal > naive > uniform
-    # Naive exploration goes on where the camera has not seen all: bits 0, 2 and 4 of the number of
-    # a state.
-    goes_on = np.arange(NUM_STATES) % 64 & 0b010101 != 0b010101
-    of_naive = found["naive"][1][:NUM_STATES]
-    np.testing.assert_array_equal(of_naive != 0, goes_on)
-    # The camera's own looks alone: no state pays more than three of the best, from a variance of
-    # 20 in three dimensions to sqrt(3).
-    most = 3 * (1 / 3**0.5 - 1 / 60**0.5)
-    assert max(total.max() for total in of.values()) <= most + 1e-4
 
 
 def test_values_that_are_not_numbers_give_totals_that_are_none():
@@ -136,13 +108,6 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy
     np.testing.assert_array_equal(found, found[[0] * 6])
 
 
-def test_naive_and_random_policies_are_played_an_eighth_as_often(same_policy):
-    # An eighth of nine, rounded up, is two.
-    often, seldom = same_policy[9][0], same_policy[2][0]
-    assert np.any(often != seldom)
-    np.testing.assert_array_equal(same_policy[9], [often, often, *[seldom] * 4])
-
-
 def test_the_learned_return_is_the_mean_over_random_starts():
     @jax.jit
     def returned(bias):
@@ -155,29 +120,6 @@ def test_the_learned_return_is_the_mean_over_random_starts():
     total = returned(jnp.array([1.0, 0.0, 0.0, 0.0]))
     assert -8 < total < -7 + 1 / 3**0.5
     assert np.isnan(returned(jnp.array([jnp.nan, 0.0, 0.0, 1.0])))
-
-
-def test_other_numbers_of_pois_are_played_an_eighth_as_often_but_always_once(monkeypatch):
-    played = []
-
-    def play(key, config, *, num_pois, **inputs):
-        assert inputs == {"modality": 0}
-        played.append((num_pois, config.evaluation.num_repeats, config.evaluation.num_states))
-
-    monkeypatch.setattr(comparison, "play_policies", play)
-    team = jaxsense.PRESETS["team"]
-    for repeats in (1, 96):
-        settings = replace(team.evaluation, num_repeats=repeats, num_pois=(5, 20))
-        comparison.play_numbers(KEY, replace(team, evaluation=settings), modality=0)
-    assert played == [(5, 1, 1), (20, 1, 1), (5, 12, 1), (20, 12, 1)]
-
-
-@pytest.mark.parametrize("num_pois", [None, 2, 5])
-def test_policies_are_played_with_the_number_of_pois_that_is_asked_for(num_pois):
-    mdp = held_out_mdp(CONFIG, in_place(), detections((), EXACT), num_pois)
-    assert mdp.num_pois == (num_pois or 3)
-    assert jax.eval_shape(map_mdp.reset, KEY, mdp).belief.mean.shape == (num_pois or 3, 3)
-    np.testing.assert_array_equal(mdp.looks.features[1], EXACT[1])
 
 
 def test_groups_of_episodes_change_nothing(monkeypatch):
@@ -194,10 +136,3 @@ def test_groups_of_episodes_change_nothing(monkeypatch):
     np.testing.assert_array_equal(waited, [3.0, 9.0, 3.0, 9.0, -3.0, -3.0])
     monkeypatch.setattr(comparison, "_LEAST_GROUP", 4)
     np.testing.assert_array_equal(comparison._in_groups(longest, looks, starts)[1], [9.0] * 6)
-
-
-def test_groups_need_not_divide_the_episodes(monkeypatch):
-    monkeypatch.setattr(comparison, "_LEAST_GROUP", 2)
-    looks = jnp.array([4, 3, 2, 1, 0])
-    found, _ = comparison._in_groups(lambda x: (x, x), looks, (jnp.arange(5.0),))
-    np.testing.assert_array_equal(found, jnp.arange(5.0))

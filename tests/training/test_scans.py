@@ -1,7 +1,7 @@
 """A JMVAE that learns from scans: groups of looks, and labels that only name what it has found."""
 
 import dataclasses
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,15 +10,14 @@ import pytest
 from tiny import inputs_of, learn_by_stages
 
 from jaxsense import PRESETS, Config, looks, training
-from jaxsense.config import ConfigError, DetectorConfig, FilterConfig, JmvaeConfig
+from jaxsense.config import DetectorConfig, FilterConfig, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.models import make_shape
-from jaxsense.sim import world as worlds
-from jaxsense.training import detections, scans
+from jaxsense.training import scans
 from jaxsense.training.scans import Shown
 from jaxsense.training.stage import Stage
-from jaxsense.training.surveys import Survey, divide, draw_scenes, num_scenes
-from jaxsense.vae import detectors, leave_one_out, novelty
+from jaxsense.training.surveys import draw_scenes, num_scenes
+from jaxsense.vae import leave_one_out
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
@@ -51,22 +50,6 @@ def learned():
     return learn_by_stages(KEY, once, until="grouped")
 
 
-def test_the_restart_with_the_lowest_finite_loss_is_kept():
-    restarts = tuple((jnp.float32(i), jnp.float32(x)) for i, x in enumerate((np.nan, 2.0, 1.0)))
-    best = jax.jit(lambda restarts: scans.best(KEY, TINY, restarts=restarts))
-    assert best(restarts) == 2
-    assert best(restarts[:2]) == 1
-    assert best(restarts[:1]) == 0
-
-
-def test_a_jmvae_of_scans_comes_before_its_detectors():
-    names = list(stages_of(TINY))
-    assert names[:12] == [
-        "scenes", "survey", "examples", "views", "jmvae_1", "jmvae_2", "best_jmvae",
-        "class_beliefs", "shown", "detector_camera", "detector_lidar", "detections",
-    ]  # fmt: skip
-
-
 def test_scenes_come_in_groups_that_show_the_same_pois():
     draw = jax.jit(draw_scenes)
     keys, classes, is_empty, places = draw(KEY, TINY)
@@ -83,20 +66,6 @@ def test_scenes_come_in_groups_that_show_the_same_pois():
     assert not of_scenes & {tuple(x) for x in of_groups[:, 0]}
     plain = draw(KEY, dataclasses.replace(TINY, jmvae=JmvaeConfig()))
     assert plain[3] is None
-
-
-def test_the_same_pois_stand_in_another_light():
-    world = worlds.make_world(TINY)
-    classes, place, keys = jnp.array([0, 1, 2]), jax.random.key(7), jax.random.split(KEY)
-    draw = jax.jit(lambda key, place: worlds.random_scene(key, world, classes, place))
-    one, two = (draw(key, place) for key in keys)
-    for name in ("position", "yaw", "shape", "colour"):
-        np.testing.assert_array_equal(getattr(one.layout, name), getattr(two.layout, name))
-    assert not np.allclose(one.light.direction, two.light.direction)
-    assert not np.allclose(one.poses, two.poses)
-    other = draw(keys[0], jax.random.key(8))
-    assert not np.allclose(one.layout.position, other.layout.position)
-    np.testing.assert_array_equal(one.light.direction, other.light.direction)
 
 
 def test_groups_hold_all_looks_at_one_poi():
@@ -128,23 +97,6 @@ def test_no_label_enters_the_training(learned):
     np.testing.assert_allclose(renamed.mean, jnp.roll(found.mean, 1, axis=0), atol=1e-6)
 
 
-def test_encoders_are_detectors(learned):
-    outputs = learned.outputs
-    assert learned.is_finite
-    for m, name in enumerate(("camera", "lidar")):
-        encoder = outputs[f"detector_{name}"]
-        bank = outputs["detections"].bank[m]
-        assert bank.shape == (3, 12, 2)
-        np.testing.assert_allclose(bank.sum(axis=-1), 1, rtol=1e-5)
-        window = outputs["survey"].others.windows[m][0, 0]
-        found = jax.eval_shape(encoder.logits, window, jnp.float32(1.0))
-        assert found.shape == (3,)
-        assert np.isfinite(encoder.threshold)
-    grouped = outputs["grouped"]
-    assert set(grouped) == {"pair", "all_looks"}
-    assert all(0 <= x <= 1 for x in grouped.values())
-
-
 def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypatch):
     """A PoI that looks like another class goes there, whatever its label."""
     outputs, listed = learned.outputs, stages_of(TINY)
@@ -158,11 +110,6 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
     found = begun(stage, TINY, {**outputs, "shown": taken_for})
     for bank in found.bank:
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
-
-
-def test_a_jmvae_of_scans_needs_a_filter():
-    with pytest.raises(ConfigError, match=r"jmvae.fusion = 'in_place'.*must be filter"):
-        JmvaeConfig(learns_from="scans")
 
 
 def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
@@ -218,45 +165,6 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     assert all(len(x) == 10 * TINY.arena.num_pois for x in outputs["views"].groups)
 
 
-def test_without_looks_to_calibrate_with_probabilities_stay_as_they_are(learned):
-    config = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, calibration=0.0))
-    listed, outputs = stages_of(config), dict(learned.outputs)
-    for name in ("shown", "detector_lidar"):
-        outputs[name] = begun(listed[name], config, outputs)
-    assert outputs["shown"].calibrating.shape == (0, 3)
-    assert outputs["detector_lidar"][0].sharpness == 1
-
-
-def test_calibration_leaves_a_group_to_learn_from():
-    """Two scenes of three PoIs in one group of scenes that show the same."""
-    few = DetectorConfig(num_scans=6, calibration=0.5)
-    with pytest.raises(ConfigError, match=r"calibration = 0.5: leaves none of 9 scans"):
-        dataclasses.replace(TINY, detector=few)
-    dataclasses.replace(TINY, detector=dataclasses.replace(few, num_scans=10))
-
-
-def test_no_two_starts_of_live_episodes_show_the_same_pois(monkeypatch):
-    dqn = dataclasses.replace(SMOKE.dqn, observe="live", num_envs=4)
-    config = dataclasses.replace(TINY, dqn=dqn)
-    num_train, num_bank, num_held_out, num_empty = num_scenes(config)
-    total = num_train + num_bank + num_held_out + num_empty
-    group = jnp.arange(total) // 3
-    windows = tuple(jnp.zeros((total, 3, 1)) for _ in range(2))
-    classes, scenes = jnp.repeat(group[:, None], 3, axis=1) % 3, cast("Any", group)
-    survey = Survey(classes, scenes, windows, jnp.ones((total, 2, 3)))
-    monkeypatch.setattr(looks, "features", lambda trained, windows, distances: windows)
-
-    @jax.jit
-    def starts(survey):
-        surveyed = divide(config, survey)
-        return detections.detect(KEY, config, surveys=surveyed, trained=()).starts
-
-    found = starts(survey)
-    np.testing.assert_array_equal(found.scenes, num_train // 3 + np.arange(64))
-    assert num_bank == 3 * 64  # none of those to measure on
-    np.testing.assert_array_equal(found.classes[:, 0], found.scenes % 3)
-
-
 REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, num_repeats=30))
 
 
@@ -274,41 +182,3 @@ def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(lea
     of_scenes = jax.random.key_data(places)[num_train : num_train + num_bank]
     expected = np.asarray(of_scenes)[np.arange(30) % groups * 3]
     np.testing.assert_array_equal(jax.random.key_data(found.places), expected)
-
-
-def test_novelty_learns_from_what_all_looks_show(learned, monkeypatch):
-    given = {}
-
-    def repeat(keys, world, classes, modality, number, places):
-        given[modality] = classes, places
-        assert number == 4  # looks in a scene
-        return jnp.zeros((30, number, 2)), jnp.ones((30, number)), jnp.zeros((30, number, 2))
-
-    def fit(found, positions, classes):
-        given["fit"] = classes
-        return jnp.float32(0), jnp.float32(1)
-
-    monkeypatch.setattr(looks, "repeats", repeat)
-    monkeypatch.setattr(detectors, "features", lambda *_: jnp.ones(2) / 2)
-    monkeypatch.setattr(novelty, "fit", fit)
-    stage, outputs = stages_of(REPEATING)["novelty"], learned.outputs
-    shown = dataclasses.replace(outputs["shown"], bank=jnp.full_like(outputs["shown"].bank, 2))
-    inputs = inputs_of("novelty", REPEATING, {**outputs, "shown": shown})
-    stage.begin(KEY, REPEATING, **inputs)
-    expected = scans.repeated(KEY, REPEATING, scenes=outputs["scenes"], shown=shown)
-    np.testing.assert_array_equal(given["fit"], np.full(30, 2))
-    for m in range(2):
-        np.testing.assert_array_equal(given[m][0], expected.classes)
-        assert (given[m][1] == expected.places).all()
-
-
-def test_encoders_are_calibrated_once(learned, monkeypatch):
-    """Before it learns where PoIs are: a run finishes a stage after every chunk, to check it."""
-    stage = stages_of(TINY)["detector_lidar"]
-    state = begun(stage, TINY, learned.outputs)
-    monkeypatch.setattr(leave_one_out, "calibrate", None)
-    monkeypatch.setattr(scans, "_posteriors", None)
-    finish = jax.jit(lambda state, inputs: stage.finish(TINY, state, **inputs))
-    found = finish(state, inputs_of(stage.name, TINY, learned.outputs))
-    assert found.sharpness == learned.outputs["detector_lidar"].sharpness
-    assert np.isfinite(found.threshold)

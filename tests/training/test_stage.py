@@ -83,26 +83,3 @@ def test_optional_stages_may_diverge_and_no_others(is_optional, wrong, monkeypat
     assert bool(found.is_finite) == (is_optional or wrong is None)
     assert set(found.outputs) == {"before", "s", "after"}
     assert set(found.progress) == {"s"}
-
-
-def names_of(**changes):
-    return [stage.name for stage in training.stages.stages(dataclasses.replace(TINY, **changes))]
-
-
-def test_the_stages_of_a_training():
-    names = names_of()
-    assert names == [
-        "scenes", "survey", "examples", "detector_camera", "detector_lidar", "detections",
-        "jmvae_1", "jmvae_2", "best_jmvae", "class_beliefs", "novelty", "detector_metrics",
-        "fusion", "latent_space", "look_values", "beliefs", "starts", "dqn_camera", "dqn_lidar",
-        "policies_camera", "policies_lidar",
-    ]  # fmt: skip
-    optional = [s.name for s in training.stages.stages(TINY) if s.is_optional]
-    assert optional == ["jmvae_1", "jmvae_2"]
-    filtered = dataclasses.replace(TINY.jmvae, fusion="filter")
-    dqn = dataclasses.replace(TINY.dqn, task="team", observe="bank")
-    others = names_of(jmvae=filtered, dqn=dqn)
-    assert len(set(others)) == len(others)
-    assert set(others) - set(names) == {"filter", "dqn_team", "tours"}
-    assert set(names) - set(others) == {"dqn_camera", "dqn_lidar"}
-    assert others.index("filter") + 1 == others.index("fusion")

@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, SMOKE, TINY, stage_of
+from tiny import KEY, SMOKE, stage_of
 
 from jaxsense import looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
-from jaxsense.sim.world import make_world
 from jaxsense.training.surveys import Survey, num_scenes
 from jaxsense.vae import detectors
 
@@ -41,19 +40,6 @@ def scenes():
 def surveys_of(scenes):
     survey = stage_of("survey", MEASURED)
     return jax.jit(lambda scenes: survey.begin(KEY, MEASURED, scenes=scenes))(scenes)
-
-
-def test_scenes_are_as_empty_whoever_works_them_out(surveys):
-    """Threads and devices share the rows of a survey."""
-    half = len(scenes()[0]) // 2
-    parts = [
-        surveys_of(jax.tree.map(lambda x: x[part], scenes()))  # noqa: B023
-        for part in (slice(half), slice(half, None))
-    ]
-    together = np.concatenate([part.distances for part in parts])
-    np.testing.assert_array_equal(together, surveys.distances)
-    assert (together[:half] == 1).all()
-    assert (together == 2).any()
 
 
 MEASURED = dataclasses.replace(
@@ -130,17 +116,3 @@ def test_numbers_of_scenes(num_pois, num_scans, observe, together, expected):
         dqn=dataclasses.replace(MEASURED.dqn, observe=observe),
     )
     assert num_scenes(config) == expected
-
-
-@pytest.mark.slow
-def test_a_scene_is_the_same_whoever_works_it_out():
-    listed = {stage.name: stage for stage in training.stages.stages(TINY, make_world(TINY).arena)}
-    scenes = listed["scenes"].begin(KEY, TINY)
-    survey = jax.jit(listed["survey"].begin)
-    first, second = (
-        survey(KEY, TINY, scenes=jax.tree.map(lambda x: x[i : i + 4], scenes))  # noqa: B023
-        for i in (0, 2)
-    )
-    same = jax.tree.map(lambda x, y: np.abs(x[2:] - y[:2]).max(), first.scenes, second.scenes)
-    assert max(jax.tree.leaves(same)) < 1e-6
-    assert np.abs(first.scenes.poses[0] - first.scenes.poses[1]).max() > 0.01

@@ -1,6 +1,5 @@
 """Fusion in place: which encoder is asked, and with what; and what every kind of fusion has."""
 
-import inspect
 import itertools
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.core.types import Belief, Fusion
+from jaxsense.core.types import Belief
 from jaxsense.vae import filter, fusion, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
 
@@ -24,7 +23,7 @@ decode = jax.jit(jmvae.decode, static_argnums=1)
 update = jax.jit(fusion.InPlace.update, static_argnames="modality")
 
 
-@pytest.fixture(scope="module", params=[TWO, THREE], ids=["two", "three"])
+@pytest.fixture(scope="module", params=[THREE], ids=["three"])
 def model_and_params(request):
     return request.param, init(jax.random.key(0), request.param)
 
@@ -92,32 +91,10 @@ def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-def test_trained_decoders_tell_what_a_sensor_alone_has_seen():
-    """A camera that knows the row of four classes, and a LiDAR that knows the column."""
-    row, column = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
-    bank = tuple(jnp.eye(2)[x][:, None] for x in (row, column))
-    params = init(jax.random.key(0), TWO)
-    config = JmvaeConfig(batch=16, steps=300, learning_rate=0.02, reconstruction_weights=(1.0, 1.0))
-    trained = fusion.train_decoders(jax.random.key(1), params, TWO, bank, config)
-    jax.tree.map(np.testing.assert_array_equal, trained["encoders"], params["encoders"])
-    for m, given in ((0, (bank[0][0, 0], None)), (1, (None, bank[1][1, 0]))):
-        read = decode(trained, TWO, encode(trained, TWO, given)[0])[m]
-        np.testing.assert_allclose(read, given[m], atol=0.05)
-
-
 def test_a_prior_has_mean_zero_and_the_given_variance():
     belief = fusion.prior(TWO, 20.0)
     np.testing.assert_array_equal(belief.mean, [0.0, 0.0])
     np.testing.assert_allclose(belief.std, [4.472136, 4.472136], rtol=1e-6)  # sqrt(20)
-
-
-@pytest.mark.parametrize("modality", [-1, 2, 3])
-def test_a_modality_that_is_not_there_is_named(modality):
-    params, seen = init(jax.random.key(0), TWO), jnp.array([False, False])
-    with pytest.raises(
-        ValueError, match=rf"modality = {modality}: must be 0 \(camera\) or 1 \(lidar\)"
-    ):
-        update(in_place(TWO, params), OLD, seen, look(TWO, 0), modality=modality)
 
 
 CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
@@ -127,40 +104,6 @@ KINDS = {
         jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), hidden=(4,)
     ),
 }
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_fusion_has_all_of_the_protocol(kind):
-    found = KINDS[kind]()
-    public = [name for name in vars(Fusion) if not name.startswith("_")]
-    assert set(public) == {
-        "accumulates", "classes", "prior", "update", "together", "class_probabilities",
-        "most_likely_class",
-    }  # fmt: skip
-    for name in public:
-        declared, own = getattr(Fusion, name), getattr(found, name)
-        if inspect.isfunction(declared):
-            expected = list(inspect.signature(declared).parameters)[1:]
-            assert list(inspect.signature(own).parameters) == expected
-
-    # A value that is passed in: one program serves any parameters.
-    @jax.jit
-    def look(found, features):
-        seen = jnp.zeros(2, bool)
-        after = found.update(found.prior, seen, features, 1)
-        return after, found.class_probabilities(after), found.most_likely_class(after)
-
-    others = jax.tree.map(lambda x: 1.1 * x, found)
-    features = jnp.array([0.9, 0.1])
-    after, probabilities, shown = look(found, features)
-    assert not np.allclose(look(others, features)[0].mean, after.mean)
-    assert look._cache_size() == 1
-    np.testing.assert_allclose(after.mean, found.together({1: features}).mean, rtol=1e-5)
-    assert probabilities.shape == (3,)
-    np.testing.assert_allclose(probabilities.sum(), 1.0, rtol=1e-5)
-    assert (shown.shape, shown.dtype) == ((), jnp.int32)
-    np.testing.assert_allclose(found.class_probabilities(found.prior), 1 / 3, rtol=1e-6)
-    np.testing.assert_array_equal(found.classes.mean, CLASSES.mean)
 
 
 def test_looks_together_in_place_are_the_posterior_of_all_of_them():

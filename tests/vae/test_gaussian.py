@@ -1,6 +1,5 @@
 """Divergence, sampling and moment matching against hand-worked numbers and Monte Carlo."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -59,21 +58,6 @@ def test_moment_match_as_worked_by_hand():
     np.testing.assert_allclose(std, [3.0, 0.5], rtol=1e-6)
 
 
-def test_moment_match_minimises_the_mean_divergence_from_the_components():
-    means, stds = jax.random.normal(jax.random.key(0), (2, 5, 3))
-    stds = jnp.exp(stds)
-
-    @jax.jit
-    def mean_kl(parameters):
-        kl = jax.vmap(gaussian.kl_divergence, in_axes=(0, 0, None, None))
-        return kl(means, 2 * jnp.log(stds), parameters[:3], parameters[3:]).mean()
-
-    mean, std = gaussian.moment_match(means, stds)
-    best = jnp.concatenate([mean, 2 * jnp.log(std)])
-    for change in np.concatenate([0.1 * np.eye(6), -0.1 * np.eye(6)]):
-        assert mean_kl(best + change) > mean_kl(best) + 1e-5
-
-
 def test_product_as_worked_by_hand():
     # Precisions 2 and 4 hold the prior's 1 each: 1 + 1 + 3 = 5, mean (2 x 1 + 4 x 3) / 5.
     means, log_vars = jnp.array([[1.0], [3.0]]), jnp.log(jnp.array([[0.5], [0.25]]))
@@ -95,11 +79,3 @@ def test_sample_as_worked_by_hand():
     two = jnp.stack([mean, mean], axis=-1), jnp.stack([log_var, log_var], axis=-1)
     z = gaussian.sample(jnp.array([[1.5, 0.0], [-2.0, 4.0]]), *two)
     np.testing.assert_allclose(z, [[5.0, 2.0], [-2.0, 1.0]], rtol=1e-6)
-
-
-def test_sample_is_differentiable_in_mean_and_log_variance():
-    noise, mean, log_var = jnp.array([0.3, -1.2]), jnp.array([2.0, -1.0]), jnp.array([LOG4, 0.0])
-    by_mean, by_log_var = jax.jacobian(gaussian.sample, argnums=(1, 2))(noise, mean, log_var)
-    np.testing.assert_allclose(by_mean, np.eye(2), atol=1e-6)
-    # z = m + exp(v / 2) e, so dz/dv = exp(v / 2) e / 2: 2 x .3 / 2 and -1.2 / 2.
-    np.testing.assert_allclose(by_log_var, np.diag([0.3, -0.6]), rtol=1e-5)

@@ -37,30 +37,3 @@ def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
     pairs = set(zip((camera % 10).ravel().tolist(), (first % 10).ravel().tolist(), strict=True))
     assert len(pairs) == 3 * 5
     assert not np.array_equal(camera[0], camera[1])
-
-
-@pytest.mark.parametrize(
-    ("bank", "expected"),
-    [
-        ((CAMERA, LIDAR[:3]), "lidar has 3 classes or rows: must be 4, as many as of camera"),
-        ((CAMERA, LIDAR[..., :1]), r"lidar has the shape \(4, 5, 1\): must be \[C, S, 2\]; give"),
-        (
-            (CAMERA[:, 0], LIDAR),
-            r"camera has the shape \(4, 1\): .*; give \[N, 1\] as x\[:, None\]",
-        ),
-        ((CAMERA, LIDAR[:, :0]), r"lidar has the shape \(4, 0, 2\): must hold one row or more"),
-        ((CAMERA, None), "lidar = None: must be an array; leave out rows without it"),
-    ],
-)
-@pytest.mark.parametrize("is_traced", [False, True])
-def test_a_bank_of_the_wrong_shape_is_named(bank, expected, is_traced):
-    train = jax.jit(jmvae.train, static_argnums=2) if is_traced else jmvae.train
-    with pytest.raises(ValueError, match=f"^bank of {expected}"):
-        train(jax.random.key(0), {}, MODEL, bank, SETTINGS)
-
-
-def test_a_bank_with_a_gap_is_named():
-    gap = LIDAR.copy()
-    gap[2, 3] = np.nan
-    with pytest.raises(ValueError, match="bank of lidar = nan: must be finite"):
-        jmvae.train(jax.random.key(0), {}, MODEL, (CAMERA, gap), SETTINGS)

@@ -1,7 +1,5 @@
 """The JMVAE of scans: its loss against a plain one in NumPy, and what its encoders know."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -173,16 +171,6 @@ def test_features_are_probabilities_of_labels_read_from_the_posterior():
     np.testing.assert_allclose(sharper, found**2 / np.sum(np.asarray(found) ** 2), rtol=1e-4)
 
 
-def test_an_encoder_answers_where_its_detector_of_presence_does():
-    encoder, window, distance = encoder_of(), jnp.array([-0.6]), jnp.float32(1.0)
-    odds = encoder.presence.logits(window, distance)[-1]
-    assert encoder.logits(window, distance)[-1] == odds
-    for above in (-0.1, 0.1):
-        presence = dataclasses.replace(encoder.presence, threshold=odds + above)
-        given = dataclasses.replace(encoder, presence=presence)
-        assert detectors.detect(given, window, distance).is_there == (above < 0)
-
-
 def test_calibration_finds_how_sharp_labels_are():
     encoder = encoder_of()
     windows = np.full((100, 1), -0.4, np.float32)
@@ -193,21 +181,6 @@ def test_calibration_finds_how_sharp_labels_are():
 
 
 # Clusters: found where points are apart, and named by most of their points.
-
-PLACES = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0], [3.0, 3.0], [9.0, 9.0]])
-
-
-@pytest.mark.slow
-def test_centres_are_found_wherever_the_starts_fall():
-    of_point = np.repeat(np.arange(5), [400, 30, 400, 400, 5])
-    noise = 0.1 * np.random.default_rng(0).normal(size=(len(of_point), 2))
-    points = jnp.asarray(PLACES[of_point] + noise, jnp.float32)
-    for seed in range(5):
-        found = leave_one_out.centres(jax.random.key(seed), points, 5)
-        order = leave_one_out.nearest(jnp.asarray(PLACES, jnp.float32), found)
-        assert len(set(np.asarray(order).tolist())) == 5
-        means = [points[of_point == i].mean(axis=0) for i in range(5)]
-        np.testing.assert_allclose(found[order], np.stack(means), atol=1e-4)
 
 
 def test_a_point_belongs_to_the_nearest_centre():
@@ -222,9 +195,3 @@ def test_no_two_classes_are_one_cluster():
     found = np.asarray(leave_one_out.named(members, classes, 3))
     assert found[0] == 0
     assert sorted(found) == [0, 1, 2]
-
-
-def test_a_class_is_the_cluster_with_most_of_its_points():
-    members = jnp.array([2, 2, 0, 0, 0, 1, 2])
-    classes = jnp.array([0, 0, 0, 1, 1, 2, 2])
-    np.testing.assert_array_equal(leave_one_out.named(members, classes, 3), [2, 0, 1])

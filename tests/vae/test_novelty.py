@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.special
 
 from jaxsense.vae import novelty
 from jaxsense.vae.novelty import Novelty
@@ -24,15 +23,6 @@ def test_weights_by_hand():
     np.testing.assert_allclose(TWO.weight(jnp.zeros(1), 1), 1.3**-2, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("correlation", "strength"), [(0.2, 0.225), (0.5, 0.732), (0.9, 3.36)])
-def test_weights_follow_what_a_mean_of_correlated_measurements_is_worth(correlation, strength):
-    looks = np.arange(1, 5)
-    worth = looks / (1 + (looks - 1) * correlation)
-    each = Novelty(jnp.array([strength]), jnp.ones(1))
-    apart = jnp.where(np.tri(4, k=-1, dtype=bool), 0.0, NONE)
-    np.testing.assert_allclose(np.cumsum(each.weight(apart, 0)), worth, rtol=0.02)
-
-
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_half_of_a_look_is_new_at_the_end_of_the_way(number):
     there = jnp.where(jnp.arange(5) < number, 0.0, NONE)
@@ -41,12 +31,6 @@ def test_half_of_a_look_is_new_at_the_end_of_the_way(number):
     # It is as much shorter as the robot has gone already.
     np.testing.assert_allclose(TWO.to_go(there + 0.2, 0), way - 0.2, rtol=1e-5)
     assert TWO.to_go(there + way + 1e-3, 0) == 0
-
-
-def test_independent_looks_are_new_from_anywhere():
-    found = novelty.independent(3)
-    assert [float(found.weight(jnp.array([d, d]), 2)) for d in (0.0, 0.1, NONE)] == [1, 1, 1]
-    assert found.to_go(jnp.zeros(3), 2) == 0
 
 
 fit = jax.jit(novelty.fit)
@@ -67,17 +51,6 @@ def _looks(key, number, share, apart):
     return found, jnp.broadcast_to(positions, (number, 4, 2)), classes
 
 
-@pytest.mark.slow
-def test_it_learns_that_repeated_looks_say_nothing_and_distant_ones_everything():
-    same_key, far_key = jax.random.split(jax.random.key(0))
-    near, far = _looks(same_key, 5000, 1.0, 0.0), _looks(far_key, 5000, 0.0, 3.0)
-    found, positions, classes = (np.concatenate(x) for x in zip(near, far, strict=True))
-    strength, length = fit(found, positions, classes)
-    each = Novelty(strength[None], length[None])
-    assert each.weight(jnp.zeros(1), 0) < 0.1
-    assert each.weight(jnp.full(1, 3.0), 0) > 0.9
-
-
 def test_it_learns_the_share_that_looks_have_in_common():
     # Four looks that share half of their noise are worth 4 / 2.5 = 1.6.
     found, positions, classes = _looks(jax.random.key(1), 10_000, 0.5, 0.0)
@@ -85,18 +58,3 @@ def test_it_learns_the_share_that_looks_have_in_common():
     apart = jnp.where(np.tri(4, k=-1, dtype=bool), 0.0, NONE)
     worth = jnp.sum(Novelty(strength[None], length[None]).weight(apart, 0))
     assert worth == pytest.approx(1.6, abs=0.3)
-
-
-@pytest.mark.slow
-def test_maps_are_no_surer_than_right_of_looks_from_several_places():
-    """Likelihoods gain more from three scenes in ten, than they lose by errors in the others."""
-    shared_key, own_key = jax.random.split(jax.random.key(2))
-    shared, own = _looks(shared_key, 7000, 1.0, 0.1), _looks(own_key, 3000, 0.0, 0.1)
-    found, positions, classes = (np.concatenate(x) for x in zip(shared, own, strict=True))
-    strength, length = fit(found, positions, classes)
-    apart = 0.1 * np.abs(np.arange(4.0)[:, None] - np.arange(4.0)[None])
-    apart = np.where(np.tri(4, k=-1, dtype=bool), np.float32(apart), NONE)
-    weights = np.asarray(Novelty(strength[None], length[None]).weight(apart, 0))
-    fused = scipy.special.softmax(np.cumsum(weights[:, None] * found, axis=1)[:, 1:], axis=-1)
-    surer = fused.max(axis=-1) - (fused.argmax(axis=-1) == np.asarray(classes)[:, None])
-    assert np.mean(surer) <= 0.003

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from jaxsense.core.types import Belief
 from jaxsense.vae import fusion, readout
@@ -25,14 +23,6 @@ def read(belief, prior=PRIOR):
 
 
 mixture = jax.jit(readout.mixture)
-
-
-@given(st.lists(st.floats(0.001, 1.0), min_size=3, max_size=3))
-@settings(max_examples=30, deadline=None)
-def test_a_mixture_gives_back_its_weights(shares):
-    shares = np.array(shares) / np.sum(shares)
-    found = read(mixture(CLASSES, jnp.array(shares, jnp.float32)))
-    np.testing.assert_allclose(found, shares, atol=2e-5)
 
 
 def test_a_mixture_has_the_moments_by_hand():
@@ -136,13 +126,6 @@ def test_a_divergence_as_worked_by_hand():
 
 
 CLASS_MEANS = jnp.array([[0.0, 0.0], [3.0, 0.0], [0.0, 4.0]])
-
-
-def test_sigma_norm_is_the_euclidean_norm_over_the_last_axis():
-    # sqrt(9 + 16) = 5, sqrt(.36 + .64) = 1.
-    np.testing.assert_allclose(
-        readout.sigma_norm(jnp.array([[3.0, 4.0], [0.6, 0.8]])), [5.0, 1.0], rtol=1e-6
-    )
 
 
 @pytest.mark.parametrize(
