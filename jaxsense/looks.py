@@ -122,7 +122,6 @@ def _require_fitting(config: Config, models: Models, looks: Looks) -> None:
             checks.require_number("looks at each class", features.shape[1])
             checks.require_finite("looks", features)
     if isinstance(looks, Live):
-        checks.require_one_each("detectors", looks.detectors, config.modalities)
         for sensor, detector in zip(looks.world.sensors, looks.detectors, strict=True):
             size, found = sensor.window * sensor.channels, detector.window_size
             if found != size:
@@ -235,6 +234,7 @@ def by_class(
     return flat[jnp.stack([rows_of(c) for c in range(num_classes)])]
 
 
+@checks.typed
 def detections(key: Key, config: Config, models: Models, samples: int) -> Samples:
     """Features of simulated looks at every class, for a `Bank`.
 
@@ -247,7 +247,6 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     Raises:
       ValueError: if `samples` is not positive, or looks lie outside the detectors' domains.
     """
-    checks.require_key(key)
     checks.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)

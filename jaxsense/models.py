@@ -271,7 +271,6 @@ def make_encoder(
 @checks.typed
 def init(key: Key, config: Config) -> Models:
     """Untrained models, to try functions before training."""
-    checks.require_key(key)
     detector_key, jmvae_key, dqn_key, filter_key, tours_key = jax.random.split(key, 5)
     model, agent = make_jmvae(config), make_agent(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))

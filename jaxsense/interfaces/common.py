@@ -65,6 +65,7 @@ def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.
     """
+    checks.require_key(key)
     checks.require_number("number of starts", number)
     # A start is the same for all sensors.
     played = OneAgent(mdp, 0) if isinstance(mdp, MapMdp) else mdp

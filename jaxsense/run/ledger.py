@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxsense.config import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES, Config
-from jaxsense.core import checks
 from jaxsense.mission.maps import MOST_LOOKS
 from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.run import devices
@@ -31,7 +30,6 @@ def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
     A CPU holds them in its caches, an accelerator in a small part of its memory, and more the more
     there are.
     """
-    checks.require_number("total", total)
     memory = devices.memory()
     if memory is None:
         most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))

@@ -154,6 +154,8 @@ def _require(
     is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
     is_seed = is_whole and 0 <= seed < 2**32
     require(is_seed, "seed", seed, "must be a whole number from 0 to 2^32 - 1")
+    is_named = isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)
+    require(is_named, "policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():
         is_policy = callable(each) or isinstance(each, Policy)
         require(is_policy, "policies", name, "must be a function or a dqn.Policy")
@@ -161,7 +163,6 @@ def _require(
     is_list = isinstance(against, list | tuple) and bool(against)
     is_known = is_list and all(name in names for name in against)
     require(is_known, "against", against, f"must be a list of one or more of {', '.join(names)}")
-    checks.require_one_each("models.detectors", models.detectors, config.modalities)
     number = config.arena.num_pois
     reason = "must be the number of PoIs that the models were trained with"
     require(models.agent.plays(number), "arena.num_pois", number, reason)

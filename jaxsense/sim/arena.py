@@ -87,6 +87,7 @@ class Arena:
         return axes.reshape(-1, 3, 3).astype(np.float32)
 
 
+@checks.typed
 @functools.cache
 def build(
     config: ArenaConfig,
@@ -176,6 +177,7 @@ def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
     return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
 
+@checks.typed
 def make_layout(
     config: ArenaConfig,
     position: Float[Array, "N 2"],
@@ -211,6 +213,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
     Args:
       classes: index of each PoI's class in `config.classes`.
     """
+    checks.require_key(key)
     per_side = min(
         int(np.ceil(np.sqrt(2 * config.num_pois))), int(np.floor(config.side / config.poi_pitch))
     )

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.config import CameraConfig
+from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 
 _NUM_WAVES = 32
@@ -92,6 +93,7 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
     Args:
       has_conditions: whether to draw what changes the light, see `World.reads_conditions`.
     """
+    checks.require_key(key)
     light_key, condition_key = jax.random.split(key)
     side, height, diffuse, ambient = jax.random.uniform(light_key, (4,))
     side, height = 2 * jnp.pi * side, jnp.radians(20.0 + 50.0 * height)

@@ -357,6 +357,7 @@ def scan(
     Raises:
       ValueError: if the sensor reads the light's conditions, and they have not been drawn.
     """
+    checks.require_key(key)
     chex.assert_shape(directions, (2, None))
     pose = robot_poses(data)[robot]
     section = _section(arena, data, sensor.height, robot, twin)

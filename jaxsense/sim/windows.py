@@ -38,6 +38,7 @@ def _first_ray(sensor: Sensor, bearing: Float[Array, ""]) -> Int[Array, ""]:
     return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
 
 
+@checks.typed
 def cut_out(
     sensor: Sensor,
     readings: Float[Array | np.ndarray, "B *channels"],

@@ -94,6 +94,7 @@ def random_scene(
       places: random key of the PoIs' positions and directions, with which several scenes show the
         same PoIs; part of `key` by default.
     """
+    checks.require_key(key)
     layout_key, light_key, poi_key, *robot_keys = jax.random.split(key, 3 + len(world.sensors))
     place_key = layout_key if places is None else places
     layout = arenas.random_layout(place_key, world.arena.config, classes)
@@ -122,6 +123,7 @@ def look(
     Raises:
       ValueError: if there is no such robot or PoI.
     """
+    checks.require_key(key)
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     checks.require_index("poi", poi, world.arena.config.num_pois)
@@ -223,6 +225,7 @@ def survey(
       The scene, for each robot the inputs of its detector, one per PoI, and the expected distances
       of the PoIs, in metres.
     """
+    checks.require_key(key)
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
     scene = random_scene(scene_key, world, classes, places)
     robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)

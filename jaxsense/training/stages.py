@@ -145,7 +145,6 @@ def learn(
     Raises:
       ValueError: if `config` is no `Config`, or no stage has this name.
     """
-    checks.require_key(key)
     arena = _arena(config, arena)
     names = [stage.name for stage in stages(config, arena)]
     if until is not None and until not in names:

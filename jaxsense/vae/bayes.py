@@ -1,5 +1,6 @@
 """Exact Bayes over the classes, and the product of experts, to compare fusion with."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,8 +29,7 @@ def log_likelihoods(features: _Features, label_of_class: _Labels) -> Float[Array
     Raises:
       ValueError: if a label does not exist or the features are not probabilities.
     """
-    checks.require_shape("features", features, (None,))
-    checks.require_shape("label_of_class", label_of_class, (None,))
+    chex.assert_rank([features, label_of_class], 1)
     checks.require_index("label_of_class", label_of_class, len(features))
     checks.require_probabilities("features", features)
     label_of_class = jnp.asarray(label_of_class)
@@ -59,7 +59,7 @@ def bayes_update(
       ValueError: if all classes are excluded or a logarithm is NaN; see also `log_likelihoods`.
     """
     checks.require_shape("log_weights", log_weights, (None,))
-    checks.require_shape("label_of_class", label_of_class, log_weights.shape)
+    chex.assert_equal_shape([log_weights, label_of_class])
     # Rejects -inf (all classes excluded) and NaN.
     checks.require_finite("largest of log_weights", jnp.max(log_weights))
     found = log_likelihoods(features, label_of_class)

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Protocol
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,7 +109,7 @@ def features(
 def detect(detector: Detector, window: Float[Array, " F"], distance: Float[Array, ""]) -> Detection:
     """What a look says; `distance` is that of the PoI's centre, in metres."""
     checks.require_shape("window", window, (detector.window_size,))
-    checks.require_shape("distance", distance, ())
+    chex.assert_rank(distance, 0)
     found = detector.logits(window, distance)
     is_known = jnp.isfinite(window).all() & jnp.isfinite(distance) & (distance > 0)
     is_there = is_known & (found[-1] >= detector.threshold)
@@ -135,7 +136,7 @@ def search(
       distances: expected distances of the PoI's centre, in metres.
       log_prior: up to a constant; minus infinity for what is not to be considered.
     """
-    checks.require_shape("log_prior", log_prior, (len(distances), len(windows)))
+    chex.assert_shape(log_prior, (len(distances), len(windows)))
     is_valid, is_distance = jnp.isfinite(windows).all(axis=1), jnp.isfinite(distances)
     is_distance &= distances > 0
     may_be = (is_valid[None] & is_distance[:, None] & jnp.isfinite(log_prior)).reshape(-1)
@@ -211,7 +212,7 @@ def init(
     measures_distance: bool = False,
 ) -> Classifier:
     """Untrained detector, whose input is standardised by `windows` for training."""
-    checks.require_shape("windows", windows, (None, None))
+    chex.assert_rank(windows, 2)
     offset, scale = networks.statistics(windows)
     numbers = (1 + measures_distance) * len(offset) + 2
     params = networks.init(key, MLP(config.hidden, num_labels + 1), numbers)
@@ -280,7 +281,7 @@ def fitted(detector: Classifier, shown: Looks, nothing: Looks) -> Classifier:
 
 def calibrate(detector: Classifier, shown: Looks, labels: Int[Array, " S"]) -> Classifier:
     """Divides the labels' logits by the best temperature for looks that training did not use."""
-    checks.require_shape("labels", labels, (len(shown.distances),))
+    chex.assert_equal_shape([labels, shown.distances])
     best = sharpness(detector.of(shown)[:-1], labels)
     return _scaled(detector, jnp.full(detector.num_labels + 1, best).at[-1].set(1.0))
 
@@ -331,8 +332,7 @@ def retrain(
     shown, labels = jax.tree.map(jnp.asarray, (shown, labels))
     checks.require_shape("windows", shown.windows, (None, detector.window_size))
     checks.require_finite("windows", shown.windows, _IS_WHOLE)
-    checks.require_shape("labels", labels, (len(shown.windows),))
-    checks.require_shape("distances", shown.distances, labels.shape)
+    chex.assert_shape([labels, shown.distances], (len(shown.windows),))
     checks.require_index("labels", labels, detector.num_labels)
     number = config.num_training(len(labels))
     if not 0 < number < len(labels):
@@ -394,8 +394,7 @@ def negative_log_likelihood(
     probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
 ) -> Float[Array, ""]:
     """Mean of `-log p(label)` in nats."""
-    checks.require_shape("probabilities", probabilities, (None, None))
-    checks.require_shape("labels", labels, (len(probabilities),))
+    chex.assert_shape(probabilities, (len(labels), None))
     right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
     return -jnp.mean(jnp.log(jnp.maximum(right, 1e-12)))
 
@@ -415,8 +414,7 @@ def calibration_error(
 
 def reliability(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
     """Points of a reliability diagram with fifteen bins of equal width."""
-    checks.require_shape("probabilities", probabilities, (None, None))
-    checks.require_shape("labels", labels, (len(probabilities),))
+    chex.assert_shape(probabilities, (len(labels), None))
     confidence = jnp.max(probabilities, axis=1)
     is_right = jnp.argmax(probabilities, axis=1) == labels
     bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)

@@ -11,6 +11,7 @@ weights among those that `readout` reads without error: a belief is a sufficient
 
 from collections.abc import Mapping
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,7 +79,6 @@ class Filter:
         name = f"features of {model.modalities[modality]}"
         checks.require_shape(name, features, (model.feature_sizes[modality],))
         checks.require_probabilities("features", features)
-        checks.require_belief("belief", belief, model.latent_size)
         checks.require("weight", weight, lambda x: (x >= 0) & (x <= 1), "must be from 0 to 1")
         found = self.log_likelihood(self.networks, features, modality)
         before = jnp.log(self.class_probabilities(belief))
@@ -86,7 +86,6 @@ class Filter:
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """See `Fusion.together`."""
-        checks.require_type("looks", looks, Mapping, "from modalities to features")
         belief, nobody = self.prior, jnp.zeros(len(self.model.modalities), bool)
         for modality, features in looks.items():
             belief = self.update(belief, nobody, features, modality)
@@ -121,8 +120,7 @@ def init(
     key: Key, model: Jmvae, classes: Belief, prior: Belief, hidden: tuple[int, ...] = (32,)
 ) -> Filter:
     """Untrained filter, which looks do not update; see `Filter`."""
-    checks.require_shape("classes.mean", classes.mean, (None, model.latent_size))
-    checks.require_shape("prior.mean", prior.mean, (model.latent_size,))
+    chex.assert_shape([classes.mean, prior.mean], (..., model.latent_size))
     read = readout.make(classes, readout.directions(model.feature_sizes))
     network = MLP(hidden, read.of_classes.shape[1])
     keys = jax.random.split(key, len(model.modalities))

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Mapping
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,11 +96,8 @@ def fuse(
       ValueError: if `features` has another length than `model.modalities`, all are None, or one
         does not hold probabilities; if the belief is not finite or its width not positive.
     """
-    checks.require_shape("belief.std", belief.std, (model.latent_size,))
-    checks.require_shape("belief.mean", belief.mean, (model.latent_size,))
-    checks.require_shape("seen", seen, (len(model.modalities),))
-    checks.require_finite("belief.mean", belief.mean)
-    checks.require_positive("belief.std", belief.std)
+    chex.assert_shape(seen, (len(model.modalities),))
+    checks.require_belief("belief", belief, model.latent_size)
     generated = jmvae.decode(params, model, belief.mean)
     is_new = np.array([new is not None for new in features])
     others = np.flatnonzero(~is_new).tolist()

@@ -1,5 +1,6 @@
 """Diagonal Gaussians: divergence, draws, products and moment matching."""
 
+import chex
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -19,10 +20,7 @@ def kl_divergence(
     By default q is a standard normal. `log_var` are logarithms of variances; axes after the first
     broadcast.
     """
-    checks.require_shape("log_var_p", log_var_p, mean_p.shape)
-    for name, x in (("mean_q", mean_q), ("log_var_q", log_var_q)):
-        if jnp.ndim(x):
-            checks.require_shape(name, x, (len(mean_p), ...))
+    chex.assert_equal_shape([mean_p, log_var_p])
     ratio = jnp.exp(log_var_p - log_var_q)
     distance = (mean_p - mean_q) ** 2 * jnp.exp(-jnp.asarray(log_var_q))
     return 0.5 * jnp.sum(ratio + distance - 1.0 - log_var_p + log_var_q, axis=0)
@@ -30,8 +28,7 @@ def kl_divergence(
 
 def sample(noise: _Columns, mean: _Columns, log_var: _Columns) -> Float[Array, "D ..."]:
     """Reparameterised draw from standard normal `noise`, differentiable in `mean` and `log_var`."""
-    checks.require_shape("log_var", log_var, mean.shape)
-    checks.require_shape("noise", noise, mean.shape)
+    chex.assert_equal_shape([noise, mean, log_var])
     return mean + jnp.exp(0.5 * log_var) * noise
 
 
@@ -46,8 +43,8 @@ def product(
     Returns:
       Mean and log-variance.
     """
-    checks.require_shape("means", means, (None, None))
-    checks.require_shape("log_vars", log_vars, means.shape)
+    chex.assert_rank(means, 2)
+    chex.assert_equal_shape([means, log_vars])
     precisions = jnp.exp(-jnp.minimum(log_vars, 0.0))
     precision = 1.0 + jnp.sum(precisions - 1.0, axis=0)
     return jnp.sum(precisions * means, axis=0) / precision, -jnp.log(precision)
@@ -61,9 +58,9 @@ def moment_match(
     The Gaussian with these moments minimises `E KL(component || q)` over diagonal Gaussians q, the
     goal of a JMVAE's uni-modal encoders.
     """
-    checks.require_shape("mean", mean, (None, None))
-    checks.require_shape("std", std, mean.shape)
-    checks.require_number("number of components", len(mean))
     checks.require_positive("std", std)
+    chex.assert_rank(mean, 2)
+    chex.assert_equal_shape([mean, std])
+    checks.require_number("number of components", len(mean))
     variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
     return jnp.mean(mean, axis=0), jnp.sqrt(variance)

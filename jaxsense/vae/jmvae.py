@@ -8,6 +8,7 @@ full set is the joint encoder, to which a Kullback-Leibler divergence draws ever
 import dataclasses
 import itertools
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -46,9 +47,8 @@ class Jmvae:
     max_subset: int | None = None
 
     def __post_init__(self):
-        checks.require_tuple("modalities", self.modalities)
-        checks.require_tuple("feature_sizes", self.feature_sizes)
-        checks.require_tuple("hidden", self.hidden)
+        for name in ("modalities", "feature_sizes", "hidden"):
+            checks.require_type(name, getattr(self, name), tuple, "which JAX can hash")
         if not self.modalities:
             raise ValueError("modalities = (): must name one or more modalities")
         checks.require_one_each("feature_sizes", self.feature_sizes, self.modalities)
@@ -76,12 +76,12 @@ class Jmvae:
         return "+".join(self.modalities[m] for m in subset)
 
 
+@checks.typed
 def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
     """Random parameters, `{"encoders": {NAME: ...}, "decoders": {NAME: ...}}`.
 
     With a `scale` of 0.6 on all weights, features of hundreds of numbers need far fewer steps.
     """
-    checks.require_key(key)
     checks.require_positive("scale", scale)
 
     def network(key: Key, inputs: int, outputs: int) -> Params:
@@ -119,7 +119,13 @@ def encode(
       ValueError: if `features` has another length than `model.modalities`, all are None, or one is
         not finite.
     """
-    checks.require_features(features, model.modalities, model.feature_sizes)
+    checks.require_one_each("features", features, model.modalities)
+    if all(feature is None for feature in features):
+        raise ValueError(f"features = {features}: must hold one modality or more")
+    for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
+        if feature is not None:
+            checks.require_shape(f"features of {name}", feature, (size,))
+            checks.require_finite(f"features of {name}", feature)
     subset = tuple(m for m, feature in enumerate(features) if feature is not None)
     if subset in model.subsets:
         return _encode(params, model, subset, features)
@@ -153,13 +159,13 @@ def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]
     )
 
 
-@checks.typed
 def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
     """The posterior `q(z | present features)` as a belief, see `encode`."""
     mean, log_var = encode(params, model, features)
     return Belief(mean, jnp.exp(0.5 * log_var))
 
 
+@checks.typed
 def loss(
     key: Key,
     params: Params,
@@ -193,9 +199,8 @@ def loss(
     Raises:
       ValueError: if a modality's features or its weight is missing.
     """
-    checks.require_key(key)
-    checks.require_type("model", model, Jmvae, "as from Jmvae(...)")
     checks.require_one_each("features", features, model.modalities)
+    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     for name, size, x in zip(model.modalities, model.feature_sizes, features, strict=True):
         checks.require_shape(f"features of {name}", x, (size,))
     noise = jax.random.normal(key, (model.latent_size, 1))
@@ -232,11 +237,9 @@ def losses(
       beta: see `loss`.
       reconstruction_weights: see `loss`.
     """
-    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     batch = noise.shape[-1]
     for x, size in zip(features, model.feature_sizes, strict=True):
-        checks.require_shape("features", x, (size, batch))
-
+        chex.assert_shape(x, (size, batch))
     *others, every = model.subsets
     mean, log_var = _encode(params, model, every, features)
     decoded = _decode(params, model, gaussian.sample(noise, mean, log_var))
@@ -290,6 +293,7 @@ class Fitting:
         return jnp.mean(total)
 
 
+@checks.typed
 def train(
     key: Key, params: Params, model: Jmvae, bank: Samples, config: JmvaeConfig
 ) -> tuple[Params, Float[Array, "{config.steps}"]]:
@@ -315,11 +319,8 @@ def train(
         loss diverges.
       ConfigError: in JAX's 64-bit mode.
     """
-    checks.require_key(key)
     require_32_bits()
-    checks.require_type("model", model, Jmvae, "as from Jmvae(...)")
-    checks.require_type("config", config, JmvaeConfig, "as config.jmvae")
-    checks.require_bank(bank, model.modalities, model.feature_sizes)
+    _require_bank(bank, model)
     problem, state = Fitting(config, bank, model), supervised.start(params, config)
     number = min(config.steps, 100)  # whose draws are in memory together
     chunks = -(-config.steps // number)
@@ -331,6 +332,22 @@ def train(
     state, losses = jax.lax.scan(chunk, state, keys)
     checks.require_finite("losses", losses, _CONVERGES)
     return state.params, losses.reshape(-1)[: config.steps]
+
+
+def _require_bank(bank: Samples, model: Jmvae) -> None:
+    """Raises `ValueError` unless each modality has finite features of looks at the same classes."""
+    checks.require_one_each("bank", bank, model.modalities)
+    for name, size, features in zip(model.modalities, model.feature_sizes, bank, strict=True):
+        of_modality = f"bank of {name}"
+        checks.require_shape(of_modality, features, (None, None, size))
+        checks.require_shape(of_modality, features, (len(bank[0]), None, size))
+        if not features.size:
+            shape = features.shape
+            raise ValueError(f"{of_modality} has the shape {shape}: must hold one row or more")
+        checks.require_finite(of_modality, features)
+    if len(bank[0]) == 1 < min(len(bank), bank[0].shape[1]):
+        expected = "must be two or more; give rows [N, D] as x[:, None], not x[None]"
+        raise ValueError(f"bank has one class with {bank[0].shape[1]} looks: {expected}")
 
 
 def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]:
@@ -345,6 +362,7 @@ def annealed_beta(step: Int[Array, ""], config: JmvaeConfig) -> Float[Array, ""]
     return config.beta * (config.initial_beta / config.beta) ** remaining
 
 
+@checks.typed
 def log_likelihood(
     key: Key,
     params: Params,
@@ -367,7 +385,6 @@ def log_likelihood(
         given the latents.
       samples: number of latents to draw; static.
     """
-    checks.require_key(key)
     checks.require_number("samples", samples)
     checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
     given = tuple(reconstruction_weights)

@@ -10,12 +10,12 @@ whose errors have a correlation r is worth `k / (1 + (k - 1) r)` independent one
 follow its increments closely, with an `a` for each r. Both numbers are learned from repeated looks.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 
 LEAST_NEW = 0.5
@@ -88,9 +88,8 @@ def fit(
       positions: `[S, T, 2]` places of the looks, in metres.
       classes: `[S]` int32 true classes.
     """
-    checks.require_shape("found", found, (None, None, None))
-    checks.require_shape("positions", positions, (*found.shape[:2], 2))
-    checks.require_index("classes", classes, found.shape[2])
+    chex.assert_rank([found, classes], [3, 1])
+    chex.assert_shape(positions, (*found.shape[:2], 2))
     apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
     is_earlier = np.tri(found.shape[1], k=-1, dtype=bool)
     is_one_place = jnp.max(apart, axis=(1, 2)) < _SAME_PLACE

@@ -134,10 +134,6 @@ def changed(section, **values):
 
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
-    "load preset": (
-        lambda w: jaxsense.load("noisy"),
-        "run = 'noisy': must be the directory of a finished run; pretrained:noisy only names",
-    ),
     "load pretrained": (
         lambda w: jaxsense.load("pretrained:loud"),
         "preset = 'loud': must be one of default, noisy, many, raw, team",
@@ -175,11 +171,11 @@ FUNCTIONS = {
     ),
     "missions key": (
         lambda w: of_missions(w, policies={3: values}),
-        "policies = 3: must be a text, the name of a policy",
+        ": must be a dictionary from names to policies",
     ),
     "missions swapped": (
         lambda w: of_missions(w, config=w.models, models=SMOKE),
-        "config = Models: must be Config, as from load_pretrained",
+        "config = Models: must be Config, of jaxsense.config",
     ),
     "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be a list of one"),
     "missions others": (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import dqn, vae
+from jaxsense import dqn, interfaces, mission, sim, vae
 from jaxsense.core import checks
 from jaxsense.core.types import Fusion
 
@@ -50,7 +50,7 @@ def test_one_key_of_several(make):
 def _of_keys():
     """Public functions whose first argument is a key, with values of the others."""
     found = []
-    for module in (jaxsense, vae, dqn):
+    for module in (jaxsense, vae, dqn, sim, mission, interfaces):
         for name in dir(module):
             function = getattr(module, name)
             if not inspect.isfunction(function) or name.startswith("_"):
@@ -61,7 +61,7 @@ def _of_keys():
                 named = {each.name: None for each in others if each.kind is each.KEYWORD_ONLY}
                 values = [None] * (len(others) - len(named))
                 found.append(pytest.param(function, values, named, id=f"{module.__name__}.{name}"))
-    assert len(found) > 10
+    assert len(found) > 15
     return found
 
 
