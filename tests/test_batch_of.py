@@ -1,8 +1,6 @@
 """How many missions play side by side."""
 
 from dataclasses import replace
-from functools import partial
-from types import SimpleNamespace
 
 import jax
 import pytest
@@ -57,8 +55,6 @@ def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
 @pytest.mark.parametrize(
     "config",
     [
-        pytest.param(MANY, id="PoIs"),
-        pytest.param(crowded(CONFIG, num_pois=16, own_maps=False), id="robots"),
         pytest.param(crowded(CONFIG, num_pois=8), id="maps"),
         pytest.param(LARGEST, id="largest", marks=pytest.mark.slow),
     ],
@@ -88,21 +84,3 @@ def test_an_accelerator_plays_what_pays_and_fits(
 ):
     monkeypatch.setattr(devices, "memory", lambda: memory)
     assert ledger.batch_of(config, total, workers()) == expected
-
-
-@pytest.mark.parametrize(
-    ("told", "expected"),
-    [([None], 8), ([{}], 8), ([{"bytes_limit": 9 * GIB}, {"bytes_limit": 7 * GIB}], 7)],
-)
-def test_the_smallest_accelerator_counts_and_may_not_tell_its_memory(monkeypatch, told, expected):
-    assert devices.memory() is None
-    cards = [SimpleNamespace(memory_stats=partial(lambda each: each, each)) for each in told]
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(jax, "local_devices", lambda: cards)
-    assert devices.memory() == expected * GIB
-
-
-def test_missions_run_long_if_many_pois_are_to_be_looked_at():
-    assert not ledger.runs_long(CONFIG, 5_461)  # of 3 PoIs, 16,383
-    assert ledger.runs_long(CONFIG, 5_462)
-    assert ledger.runs_long(MANY, 1_024)

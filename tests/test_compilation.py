@@ -1,7 +1,7 @@
 """Programs that compile in the background."""
 
 import time
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -39,24 +39,6 @@ def test_a_program_may_be_called_before_it_is_compiled():
         program.compile(lambda x: 2 * x, jnp.float32(0))
         assert result.result() == 6
     assert heard == [("stage", 0, 0, {})]
-
-
-def test_whoever_waits_for_a_program_hears_why_it_cannot_come():
-    waiting, broken = (Program(Compiler(Monitor()), "stage", "run") for _ in range(2))
-    waiting.fail(RuntimeError("no way"))
-    with pytest.raises(RuntimeError, match="no way"):
-        waiting()
-    broken.compile(lambda x: x, jnp.float32(0))
-    assert broken(jnp.float32(1)) == 1
-    broken.fail(RuntimeError("too late"))
-    assert broken(jnp.float32(1)) == 1
-
-
-def test_nothing_is_traced_any_more_when_a_run_is_over():
-    with Compiler(Monitor()) as compiler:
-        program = Program(compiler, "stage", "run")
-    with pytest.raises(CancelledError):
-        program.compile(lambda x: pytest.fail("was traced"), jnp.float32(0))
 
 
 def test_what_is_released_is_not_compiled_any_more(monkeypatch):

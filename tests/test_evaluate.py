@@ -8,23 +8,19 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from xml.etree import ElementTree
 
 import jax
 import numpy as np
 import pytest
-import rich.console
 from recordings import FIELDS_OF_VIEW, recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
 from jaxsense.config import CONTROL_PERIOD, PRESETS, ConfigError
-from jaxsense.run import cli, devices, files, missions, rundir
+from jaxsense.run import cli, devices, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.rundir import RunDirectory
@@ -142,84 +138,6 @@ def test_evaluations_by_others_stand_apart(copy, other):
     assert f"; {words}" in theirs
 
 
-def test_a_plot_of_teams_compares_figures_of_one_origin(copy, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(evaluate.result_plots, "places", drawn.append)
-    monkeypatch.setattr(evaluate.drawing, "svg", lambda plot: b"")
-    here = read(copy)
-    own = {"origin": here["origin"], "other": {**here["origin"], "commit": "other"}}
-    for pois, origin in ((4, own["origin"]), (5, own["other"])):
-        place = {**here, "num_pois": pois, "origin": origin}
-        (copy / "evaluations" / f"{pois}.json").write_text(json.dumps(place))
-    evaluate._report(copy, jaxsense.load(copy)[0])
-    assert sorted(place["num_pois"] for place in drawn[0]) == [3, 3, 4]
-
-
-def test_an_evaluation_waits_for_another_one_that_writes_and_says_so(copy, capsys):
-    blocks, said = read(copy)["mission"], ""
-    with ThreadPoolExecutor(1) as executor:
-        with files.locked(copy):
-            writing = executor.submit(
-                write, evaluate.Arguments(copy, episodes=1), only(blocks, "latent")
-            )
-            while not said:
-                assert not wait((writing,), timeout=0.1).done
-                said = capsys.readouterr().out
-            blocks["naive"]["time_s"] = 77.0
-            changed = {**read(copy), "mission": blocks}
-            (copy / "evaluations" / f"{NAME}.json").write_text(json.dumps(changed))
-        writing.result()
-    assert said == f"Waiting for another process to finish writing to {copy}.\n"
-    assert read(copy)["mission"]["naive"]["time_s"] == 77.0
-
-
-def test_paths_are_printed_as_they_are(evaluated, tmp_path, capsys):
-    path = tmp_path / f"a[b]{'c' * 90}"
-    shutil.copytree(evaluated[0], path)
-    blocks = read(path)["mission"]
-    first, metrics = write(evaluate.Arguments(path, episodes=1, animate=True), blocks)
-    assert first == f"The first mission of latent is in {path}/mission-latent-0.svg."
-    assert f" {path}/evaluations/{NAME}.json, and with all others in {path}/report.html." in metrics
-    evaluate._print(
-        rich.console.Console(width=80, force_terminal=True, color_system=None), blocks, 1
-    )
-    printed = capsys.readouterr().out
-    assert "By median times, the latent policy is" in printed
-    assert max(map(len, printed.split("By median times")[0].splitlines())) <= 80
-
-
-def test_what_cannot_be_printed_ends_no_program(smoke_run, tmp_path):
-    path = tmp_path / "röm"
-    shutil.copytree(smoke_run, path)
-    (path / "summary.json").unlink()
-    # One process, in which jax is imported once, prints to a pipe and then to a full disk.
-    program = """
-import os, sys
-from jaxsense import train
-from jaxsense.run import output
-train._train = lambda arguments, run, *more: (run.path / "summary.json").write_text(
-    open(sys.argv[1], encoding="utf-8").read(), encoding="utf-8")
-resume = lambda: train.main(["--resume", sys.argv[2]])
-output.run(resume)
-sys.stdout.flush()
-os.unlink(os.path.join(sys.argv[2], "summary.json"))
-os.dup2(os.open("/dev/full", os.O_WRONLY), sys.stdout.fileno())
-output.run(resume)
-"""
-    command = [sys.executable, "-c", program, str(smoke_run / "summary.json"), str(path)]
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert "r\\xf6m" in ended.stdout
-    assert (path / "summary.json").exists()
-
-
-def test_evaluate_prints_the_comparison(evaluated):
-    # One mission of each policy.
-    for words in ("latent", "naive", "random", "against", "control steps/s", "12 missions"):
-        assert words in evaluated[2]
-
-
 def test_missions_elsewhere_have_the_settings_that_are_asked_for():
     config, anything = PRESETS["smoke"], lambda n: True
 
@@ -277,16 +195,7 @@ def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
     assert "2 camera, 1 lidar" in (path / "report.html").read_text(encoding="utf-8")
 
 
-def test_the_report_shows_what_was_trained_and_then_what_was_evaluated(smoke_run, evaluated):
-    path, _, _ = evaluated
-    # Plots of policies come from each set of arenas; the two films of a training play together.
-    for report, episodes, groups, policies in ((smoke_run, 4, 1, 1), (path, 1, 2, 2)):
-        text = (report / "report.html").read_text()
-        assert text.count("image/svg+xml") == 4 + policies
-        assert text.count('<figure class="films') == groups
-        assert f"{episodes} missions of each policy" in text
-
-
+@pytest.mark.slow
 def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cache):
     path, _, _ = evaluated
     config, models = jaxsense.load(path)
@@ -306,24 +215,6 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
     drawn = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
     texts = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert {f"{seconds:.1f} s", "latent policy, seed 0"} <= texts
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        (
-            ["--policy", "best"],
-            "policy = 'best': must be one of all, policies, latent, network, greedy",
-        ),
-        (["--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
-        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
-        (["--episode", "3"], "unknown option --episode; did you mean --episodes?"),
-    ],
-)
-def test_bad_options_of_evaluate_are_named_in_one_line(smoke_run, options, expected, capsys):
-    before = (smoke_run / "summary.json").read_text()
-    assert expected in error_line([str(smoke_run), *options], capsys, evaluate)
-    assert (smoke_run / "summary.json").read_text() == before
 
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):

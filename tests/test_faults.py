@@ -8,9 +8,6 @@ import subprocess
 import sys
 import time
 
-import jax
-import jax.numpy as jnp
-import optax
 import pytest
 from smoke import SMOKE, without_times
 from summaries import RESULTS
@@ -77,23 +74,3 @@ def test_a_damaged_checkpoint_is_named_in_one_line(stopped, cache, smoke_run, tm
     check_resumed(path, cache, smoke_run)
     (line,) = [x for x in capsys.readouterr().err.splitlines() if target.name in x]
     assert "is damaged" in line
-
-
-def test_a_nan_in_a_training_ends_with_one_line(stopped, tmp_path, capsys, monkeypatch):
-    path, apply = tmp_path / "run", optax.apply_updates
-    shutil.copytree(stopped, path)
-
-    def poisoned(*args):
-        return jax.tree.map(lambda x: jnp.nan * x, apply(*args))
-
-    monkeypatch.setattr(optax, "apply_updates", poisoned)
-    # Other programs than those that are kept.
-    with pytest.raises(SystemExit) as stop:
-        train.main(["--resume", str(path), "--quiet", "--cache", "None"])
-    assert stop.value.code == 2
-    said = capsys.readouterr().err.splitlines()
-    # A commit that was made since the kill is told before.
-    (line,) = [line for line in said if "Stages of this run were made with different" not in line]
-    assert stopped.name.partition("_")[0] in line
-    assert "nan" in line
-    assert not (path / "summary.json").exists()

@@ -4,7 +4,6 @@ import errno
 import os
 import queue
 import stat
-import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import PRESETS, ConfigError
+from jaxsense.config import ConfigError
 from jaxsense.core.supervised import FitState
 from jaxsense.run import files
 from jaxsense.run.checkpoints import Checkpoints, Unfinished
-from jaxsense.run.rundir import RunDirectory, Settings
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))
@@ -58,14 +56,6 @@ def test_a_file_that_cannot_be_written_stays_as_it_was(tmp_path, monkeypatch, er
     assert (raised.value.strerror, raised.value.filename) == (reason, str(path))
     assert path.read_text(encoding="utf-8") == "first"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_line_that_cannot_be_added_is_an_error_that_names_the_file(tmp_path):
-    files.append(tmp_path / "file", "first")
-    files.append(tmp_path / "file", "second")
-    assert (tmp_path / "file").read_text(encoding="utf-8") == "first\nsecond\n"
-    with pytest.raises(files.WriteError, match=r"No such file or directory: '.*nowhere/file'"):
-        files.append(tmp_path / "nowhere" / "file", "third")
 
 
 def test_many_writers_of_one_file_never_mix(tmp_path):
@@ -137,22 +127,6 @@ def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
     waiting.join()
     assert order == ["first", "second"]
     assert said.empty()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="has no flock")
-def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
-    import fcntl
-
-    def flock(descriptor, operation):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    settings = Settings("smoke", 0, PRESETS["smoke"])
-    with (
-        pytest.raises(ConfigError, match=r"out = '.*run': cannot be written \(No locks"),
-        RunDirectory.create(tmp_path / "run", settings),
-    ):
-        pass
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):

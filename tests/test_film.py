@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -193,60 +192,6 @@ def test_what_nobody_has_seen_is_listed_as_unknown(picture):
     np.testing.assert_array_equal(frames(lists["unknown: 1, 3"], "opacity"), is_seen[1])
 
 
-def test_pois_that_are_certain_are_listed_at_their_class():
-    # PoI 2 is told by one look in period 40, PoI 1 half, which leaves two classes.
-    played = recording()
-    played.records.seen[50:, 0, 1] = True
-    played.records.belief.mean[50:, 0] = [1.0, 0.0]
-    played.records.belief.std[50:, 0] = [0.4, 1.0]
-    moving = parse(draw(played=played))
-    labels = {t.text: t for t in moving.iter(f"{SVG}text") if "film-label" in t.get("class")}
-    assert set(labels) == {"green cylinder", "red cylinder", "2", "red cube"}
-    is_told = frames(labels["2"], "opacity")
-    np.testing.assert_array_equal(np.flatnonzero(is_told), np.arange(41, 60))
-    # The name of the class stands between its place and the numbers.
-    heights = [float(labels[text].get("y")) for text in ("red cylinder", "2")]
-    assert np.diff(heights) * np.sign(heights[0] - 170) > 10
-    # Only what is seen and still open has a number in the map.
-    numbers = [t for t in moving.iter(f"{SVG}text") if t.text == "1"]
-    (in_map,) = (t for t in numbers if t.get("class") == "film-number film-on-light")
-    np.testing.assert_array_equal(np.flatnonzero(frames(in_map, "opacity")), np.arange(51, 60))
-
-
-@pytest.mark.parametrize("robots", [("camera",), ("camera", "lidar")])
-def test_the_legend_fits_below_the_views(robots):
-    picture = parse(draw(dataclasses.replace(CONFIG, robots=robots)))
-    notes = [t for t in picture.iter(f"{SVG}text") if t.get("class") == "film-note"]
-    assert len(notes) == 4
-    height = float(picture.get("viewBox").split()[3])
-    assert max(float(t.get("y")) for t in notes) < height - 8
-    assert f"robots with {' and '.join(robots)} look" in picture.find(f"{SVG}title").text
-
-
-def test_films_that_last_equally_long_stay_together():
-    long, short = parse(draw(played=recording(80))), parse(draw(lasts=8.0))
-    assert duration(long) == duration(short) == (7.0, 3)
-    # The clock of the shorter one still stops at its own end.
-    assert "6.0 s" in texts(short)
-    assert "7 s" not in texts(short)
-
-
-def test_headings_tell_what_a_robot_does_and_the_time(picture):
-    found = texts(picture, "camera: ")
-    assert set(found) == {
-        f"camera: {x}" for x in ("choosing", "driving to 2", "looking at 2", "done")
-    }
-    assert {"0 s", "1 s", "5 s", "6.0 s", "lidar: done"} <= set(texts(picture))
-    # Periods 30 to 39, in frames 31 to 40, of 0.05 s each in 6 s.
-    shown = {text: frames(element, "opacity") for text, element in found.items()}
-    np.testing.assert_array_equal(np.flatnonzero(shown["camera: looking at 2"]), np.arange(31, 41))
-    np.testing.assert_array_equal(sum(shown.values()), 1)
-
-
-def test_the_longest_mission_is_still_small():
-    assert len(draw(played=recording(1200))) < 300_000
-
-
 def test_a_field_of_view_is_that_of_the_sensor():
     # As with a sensor of one's own, the settings do not tell.
     picture = parse(draw(fields_of_view={"camera": 90.0, "lidar": 270.0}))
@@ -267,12 +212,3 @@ def test_the_map_begins_with_the_prior_of_the_fusion():
     for name, value in expected.items():
         assert first[name] == pytest.approx(value, abs=0.1)
         assert float(ring.get(name)) == pytest.approx(value, abs=0.1)
-
-
-@pytest.mark.parametrize("name", ["mission.svg", "mission_naive.svg", "figures/team_mission.svg"])
-def test_films_of_the_pages_say_what_films_say_today(picture, name):
-    def notes(root):
-        return {e.text for e in root.iter(f"{SVG}text") if e.get("class") == "film-note" and e.text}
-
-    docs = Path(__file__).parents[1] / "docs"
-    assert notes(ElementTree.parse(docs / name).getroot()) == notes(picture)

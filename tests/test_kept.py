@@ -17,7 +17,7 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, files, version
+from jaxsense.run import cli, version
 from jaxsense.run import kept as kept_programs
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.kept import Kept
@@ -105,20 +105,6 @@ def test_the_numbers_of_settings_are_no_other_program(tmp_path):
     assert not is_kept(tmp_path, dataclasses.replace(config, jmvae=sizes))
 
 
-def test_options_of_jax_are_other_settings_and_its_cache_is_none(tmp_path):
-    call(Kept(tmp_path), lambda x: 2 * x, ONE)
-    for option, value, is_same in (
-        ("jax_threefry_partitionable", False, False),
-        ("jax_compilation_cache_dir", str(tmp_path / "elsewhere"), True),
-    ):
-        before = jax.config.values[option]
-        jax.config.update(option, value)
-        try:
-            assert is_kept(tmp_path, ONE) == is_same
-        finally:
-            jax.config.update(option, before)
-
-
 @pytest.mark.parametrize("damage", ["empty", "other", "cut", "bit"])
 def test_a_damaged_file_is_traced_anew(tmp_path, damage, capsys):
     kept = Kept(tmp_path)
@@ -133,45 +119,6 @@ def test_a_damaged_file_is_traced_anew(tmp_path, damage, capsys):
         assert call(kept, lambda x: 2 * x, ONE) == 2
         assert capsys.readouterr().err == told
     assert call(kept, never, ONE) == 2
-
-
-def test_a_fault_of_the_cache_shows_and_ends_nothing(tmp_path, capsys, monkeypatch):
-    call(Kept(tmp_path), lambda x: 2 * x, ONE)
-
-    def full(*args, **options):
-        raise files.WriteError(28, "No space left on device")
-
-    for owner, name, fails, reason in (
-        (kept_programs.export, "deserialize", never, "AssertionError traced"),
-        (files, "write_digested", full, "WriteError No space left on device"),
-    ):
-        with monkeypatch.context() as patch:
-            patch.setattr(owner, name, fails)
-            kept = Kept(tmp_path, *([name] if owner is files else []))
-            assert call(kept, lambda x: 2 * x, ONE) == 2
-        assert capsys.readouterr().err == f"{TOLD.format(kept.path)}{reason})\n"
-
-
-def test_the_error_of_a_program_is_its_own(tmp_path):
-    def fails(x):
-        raise ValueError("mine")
-
-    with pytest.raises(ValueError, match="mine"):
-        call(Kept(tmp_path), fails, ONE)
-
-
-def test_what_jax_cannot_write_is_traced_every_time(tmp_path, capsys):
-    kept = Kept(tmp_path)
-
-    def function(x):
-        return jax.pure_callback(lambda x: 2 * x, x, x)
-
-    for _ in range(2):
-        assert call(kept, function, ONE) == 2
-    assert not list(kept.path.glob("*.stablehlo"))
-    told = capsys.readouterr().err
-    assert told.startswith(f"{TOLD.format(kept.path)}NotImplementedError")
-    assert told.count("\n") == 1
 
 
 @pytest.fixture(scope="module")
@@ -284,9 +231,3 @@ def test_a_directory_of_others_is_refused(tmp_path, monkeypatch, name, begin):
     (tmp_path / name).chmod(0o770)
     with pytest.raises(PermissionError, match=match):
         begin(tmp_path)
-
-
-def test_jax_keeps_what_it_compiles_beside_it_unless_it_was_told_where(two_processes):
-    _, (first, second) = two_processes
-    assert first > 0
-    assert second == 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsense
-from jaxsense import looks, mission
+from jaxsense import looks
 from jaxsense.config import PLANNING_RADIUS, PRESETS, JmvaeConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
@@ -36,35 +36,6 @@ def numbered_bank():
     place = np.arange(3)[:, None] + np.arange(5) / 10
     stacked = (np.stack([place, np.full_like(place, m)], axis=-1) for m in range(2))
     return tuple(jnp.asarray(x, jnp.float32) for x in stacked)
-
-
-def test_an_arena_that_was_built_while_tracing_serves_others(models):
-    config = replace(CONFIG, arena=replace(CONFIG.arena, side=3.5))
-
-    def reset(key):
-        return map_mdp.reset(key, looks.make_mdp(config, models))
-
-    for _ in range(2):
-        jax.eval_shape(reset, jax.random.key(0))
-
-
-def test_what_is_made_twice_from_equal_settings_shares_its_programs(models):
-    again = PRESETS["smoke"], JmvaeConfig(hidden=(8,))
-    config = replace(again[0], jmvae=again[1])
-    read_mdp = jax.jit(lambda mdp: mdp.config.min_increase)
-    read_mission = jax.jit(lambda mission: mission.config.mdp.min_increase, static_argnums=0)
-    for each in (CONFIG, config):
-        read_mdp(looks.make_mdp(each, models))
-        read_mission(mission.make_mission(each, {"none": no_look}))
-    assert read_mdp._cache_size() == read_mission._cache_size() == 1
-    other = replace(config, arena=replace(config.arena, side=4.0))
-    read_mdp(looks.make_mdp(other, models))
-    read_mission(mission.make_mission(config))
-    assert read_mdp._cache_size() == read_mission._cache_size() == 2
-
-
-def no_look(key, models, known):
-    return jnp.zeros(4)
 
 
 @pytest.mark.parametrize("modality", [0, 1])
@@ -118,26 +89,6 @@ def test_an_mdp_is_an_argument_of_jit(models):
     assert np.all(found[0] != found[1])
 
 
-def test_the_way_of_looking_is_an_argument_of_jit_too(models):
-    # Live looks hold detectors and sensors: other detectors are other numbers, not another program.
-    scene_of = jax.jit(lambda mdp, key, classes: mdp.looks.scene(key, classes))
-
-    @jax.jit
-    @chex.assert_max_traces(n=1)
-    def look(mdp, scene):
-        return mdp.looks.observe(jax.random.key(3), scene, jnp.int32(0), 1)[0]
-
-    mdp = looks.make_mdp(CONFIG, models)
-    assert isinstance(mdp.looks, Live)
-    scene = scene_of(mdp, jax.random.key(0), jnp.array([0, 1, 2]))
-    # An untrained detector is sure, one without weights is not.
-    blank = tuple(
-        replace(x, params=jax.tree.map(jnp.zeros_like, x.params)) for x in models.detectors
-    )
-    other = replace(mdp, looks=replace(mdp.looks, detectors=blank))
-    assert np.all(look(mdp, scene) != look(other, scene))
-
-
 def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     config = replace(CONFIG, dqn=replace(CONFIG.dqn, task="team", hidden=(4,)))
     mdp = looks.make_mdp(config, jaxsense.init(jax.random.key(0), config), Bank(numbered_bank()))
@@ -148,48 +99,6 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     # Nothing else of them is an input of a compiled program.
     assert jax.tree.leaves(mdp.places) == [*config.team.sides, PLANNING_RADIUS]
     assert mdp.config is config.team
-
-
-@pytest.mark.parametrize(
-    ("change", "expected"),
-    [
-        ({"latent_size": 3}, "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3"),
-        ({"classes": 4}, "models.fusion holds 3 classes in 2 dimensions: must be 4 in 2"),
-        ({"window": 9}, "models.detectors of lidar: reads windows of 128 numbers; must be of 9"),
-        ({"models": None}, "models = None: must be Models"),
-        ({"looks": 1}, r"looks has 1 entries: must be 2, one for each of \('camera', 'lidar'\)"),
-        ({"looks": (3, 0, 2)}, "looks at each class = 0: must be a whole number greater than 0"),
-        ({"looks": np.nan}, "looks = nan: must be finite"),
-    ],
-)
-def test_models_and_looks_of_other_settings_are_refused_in_one_line(models, change, expected):
-    bank, given = numbered_bank(), models
-    config, of_live = CONFIG, False
-    match change:
-        case {"latent_size": size}:
-            config = replace(CONFIG, jmvae=replace(CONFIG.jmvae, latent_size=size))
-        case {"classes": _}:
-            classes = (*CONFIG.arena.classes, "green cube")
-            config = replace(CONFIG, arena=replace(CONFIG.arena, classes=classes))
-        case {"window": size}:
-            of_live, config = True, replace(CONFIG, lidar=replace(CONFIG.lidar, window=size))
-        case {"models": other}:
-            given = other
-        case {"looks": int(number)}:
-            bank = bank[:number]
-        case {"looks": tuple(shape)}:
-            bank = (jnp.zeros(shape), bank[1])
-        case {"looks": float(value)}:
-            bank = (bank[0].at[2, 1, 0].set(value), bank[1])
-    with pytest.raises(ValueError, match="^" + expected) as error:
-        looks.make_mdp(config, given, None if of_live else Bank(bank))
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("shape", [(2, 5, 2), (3, 5, 3), (3, 5)])
-def test_a_bank_of_the_wrong_shape_is_named(models, shape):
-    with pytest.raises(ValueError, match="looks of lidar"):
-        looks.make_mdp(CONFIG, models, Bank((numbered_bank()[0], jnp.zeros(shape))))
 
 
 def test_entropy_by_hand():
@@ -306,23 +215,6 @@ def features(windows_of, look_live):
 
 
 @pytest.mark.slow
-def test_surveys_look_at_pois_of_the_classes_that_they_tell(windows_of):
-    modality, _, windows, _ = windows_of
-    sensor = (CONFIG.camera, CONFIG.lidar)[modality]
-    values = 3 if modality == 0 else 1  # red, green and blue
-    assert windows.shape == (3, 500, sensor.window * values)
-    middle = windows.reshape(3, 500, sensor.window, values)[:, :, sensor.window // 2]
-    if modality == 0:
-        # Green cylinder, red cylinder, red cube: the PoI is in the middle of its window.
-        is_green = np.asarray(middle[..., 1] > middle[..., 0])
-        assert np.all(is_green.mean(axis=1)[1:] < 0.02)
-        assert is_green.mean(axis=1)[0] > 0.98
-    else:
-        # A PoI's surface is .07 to .14 m nearer than its centre, which is .3 to 1.2 m away.
-        assert np.mean((middle > 0.1) & (middle < 1.2)) > 0.98
-
-
-@pytest.mark.slow
 def test_a_short_training_tells_most_looks_apart(features):
     modality, bank, (classes, live) = features
     labels = np.array(CONFIG.label_of_class(CONFIG.modalities[modality]))
@@ -347,9 +239,3 @@ def test_live_and_bank_features_have_the_same_distribution(features):
         # And the means, within four standard errors.
         spread = np.std(values) + 1e-6
         np.testing.assert_allclose(here.mean(), there.mean(), atol=4 * spread * scale)
-
-
-@pytest.mark.parametrize("samples", [0, -1, 2.5])
-def test_a_number_of_looks_that_is_none_is_refused(models, samples):
-    with pytest.raises(ValueError, match="samples"):
-        looks.detections(jax.random.key(0), CONFIG, models, samples)

@@ -13,7 +13,6 @@ import pytest
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, loop, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.compilation import Program
 from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs
@@ -93,18 +92,6 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
     assert len(curves["seconds"]) == 3
 
 
-def test_the_output_of_a_training_is_computed_once(toy, monkeypatch):
-    call, calls = Program.__call__, []
-
-    def counted(self, *args):
-        calls.append(self._name)
-        return call(self, *args)
-
-    monkeypatch.setattr(Program, "__call__", counted)
-    toy(count)
-    assert calls == ["begin", *["advance"] * 3, "finish"]
-
-
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
     def broken(key, config, x):
         raise ArithmeticError("no such policy")
@@ -170,37 +157,6 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_tra
             shared.advance.wait()
 
 
-def test_programs_are_held_where_the_number_of_trainings_is_unknown(replace_training):
-    replace_training(count)
-    monitor = Monitor()
-    with pipeline.compiled(SMOKE, monitor) as compiled:
-        loop.train(KEY, SMOKE, compiled, monitor)
-        found = loop.train(KEY, SMOKE, compiled, monitor)
-    np.testing.assert_array_equal(found.outputs["count"], [6, 6])
-
-
-def test_the_first_state_of_a_training_is_held_no_longer_than_its_first_chunk(
-    toy, collect, monkeypatch
-):
-    begun, alive, begin, report = [], [], loop._Loop._begin, loop._Loop._report
-
-    def watched(self, stage, inputs):
-        state = begin(self, stage, inputs)
-        begun.append(weakref.ref(state))
-        return state
-
-    def reported(self, *args):
-        collect()
-        alive.append(begun[0]() is not None)
-        return report(self, *args)
-
-    monkeypatch.setattr(loop._Loop, "_begin", watched)
-    monkeypatch.setattr(loop._Loop, "_report", reported)
-    toy(count)
-    # It is saved if the first chunk fails.
-    assert alive == [True, False, False]
-
-
 @pytest.mark.parametrize("number", [3, 512, 513, 1300])
 def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
     calls, part = [], devices.part
@@ -227,15 +183,6 @@ def test_what_was_saved_is_not_trained_again(toy):
     assert not heard
     np.testing.assert_array_equal(first.outputs["count"], again.outputs["count"])
     np.testing.assert_array_equal(first.curves["count"]["double"], again.curves["count"]["double"])
-
-
-def test_what_cannot_be_saved_ends_the_run_with_its_error(toy, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Checkpoints, "save", full)
-    with pytest.raises(OSError, match="No space left on device"):
-        toy(count, saved=True)
 
 
 @pytest.mark.parametrize("bad", [(), (0,), (1,)])

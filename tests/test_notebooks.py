@@ -67,6 +67,7 @@ def test_single_functions(tmp_path, monkeypatch, capsys):
     assert printed.rstrip().endswith("stop")
 
 
+@pytest.mark.slow
 def test_your_robot(tmp_path, monkeypatch, capsys):
     names = run(notebook("your_robot"), tmp_path, monkeypatch)
     printed = capsys.readouterr().out

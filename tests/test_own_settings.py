@@ -1,9 +1,7 @@
 """Custom colours, shapes, attributes and sensors in the settings: checks, copies and JSON."""
 
-import copy
 import dataclasses
 import json
-import pickle
 import sys
 import types
 
@@ -69,13 +67,6 @@ def thermal(config, **changed):
     return Thermal(**{"height": 0.1, "rays": sim.Fan(32, 60.0), "window": 8, **changed})
 
 
-def test_settings_survive_json():
-    for config in (Config(), OWN):
-        stored = json.loads(json.dumps(dataclasses.asdict(config)))
-        assert from_plain(stored) == config
-    assert from_plain({"arena": {"side": 4.0}}).arena == ArenaConfig(side=4.0)
-
-
 def test_a_team_of_robots_survives_json():
     team = TeamConfig(travel=TravelConfig(view_distance=0.5), num_pois=(2, 5))
     for robots in (None, ("camera", "lidar", "camera")):
@@ -131,32 +122,6 @@ def test_dictionaries_of_settings_cannot_be_changed(found, change):
     assert dict(found) == before
 
 
-def test_a_dictionary_of_the_caller_is_copied():
-    values = {"cold": 5.0}
-    found = Attribute(values)
-    values["hot"] = 60.0
-    assert found.values == {"cold": 5.0}
-
-
-def test_plain_dictionaries_are_compared_as_everywhere():
-    found = Attribute({"cold": 5.0, "hot": 60.0}).values
-    assert found == {"hot": 60.0, "cold": 5.0}
-    assert found != {"hot": 60.0, "cold": 6.0}
-
-
-@pytest.mark.parametrize(
-    "again",
-    [copy.copy, copy.deepcopy, lambda config: pickle.loads(pickle.dumps(config))],
-    ids=["copy", "deepcopy", "pickle"],
-)
-def test_settings_can_be_copied(again):
-    found = again(OWN)
-    assert found == OWN
-    assert hash(found) == hash(OWN)
-    with pytest.raises(TypeError, match="settings are immutable"):
-        found.arena.colours["pink"] = (0.0, 0.0, 0.0)
-
-
 def test_the_order_of_colours_is_part_of_the_settings():
     # It orders the labels, so that programs compiled for one order are wrong for another.
     turned = dataclasses.replace(OWN.arena, colours=dict(reversed(OWN.arena.colours.items())))
@@ -184,13 +149,6 @@ def test_the_narrowest_side_of_all_shapes_in_use_counts():
     }
     arena = ArenaConfig(shapes=shapes, classes=("red slab", "red post"), poi_radius=0.2)
     assert arena.poi_half_width == pytest.approx(0.6 * 0.2)
-
-
-def test_a_sensor_is_made_by_the_function_that_is_named(own_sensors):
-    own_sensors.thermal = thermal
-    lidar, found = sim.sensors.make(OWN)
-    assert (lidar.name, found.name) == ("lidar", "thermal")
-    assert found.scan_bytes == 4 * 32
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 
-from jaxsense.config import PRESETS, SHAPES, ArenaConfig, Attribute, Shape
+from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief
-from jaxsense.dqn import POLICIES
-from jaxsense.show import colours, drawing, latent_plots, result_plots
+from jaxsense.show import colours, latent_plots, result_plots
 from jaxsense.sim import sensors
 from jaxsense.training.measures import reliability
 
@@ -22,24 +19,10 @@ LIDAR = replace(
 CURVES = {"reward": np.arange(40.0), "evaluation": np.full(40, np.nan)}
 CURVES["evaluation"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
 AGENT = {"return": 4.0, "optimal": 4.5, "naive": 3.0, "random": -1.0}
-FOUR_SHAPES = {**SHAPES, "post": Shape("cylinder", (0.5, 0.5)), "slab": Shape("box", (1.0, 0.5))}
 
 
 def lines(axes):
     return {line.get_label(): line for line in axes.lines}
-
-
-def test_files_keep_their_words_repeat_and_are_dark_on_dark_pages():
-    def content():
-        figure = Figure(figsize=(4, 3), layout="constrained")
-        figure.subplots().text(0.1, 0.5, "some words")
-        return drawing.svg(figure)
-
-    text = content().decode()
-    assert text.startswith("<?xml")
-    assert ">some words</text>" in text
-    assert text.index("<svg") < text.index("(prefers-color-scheme:dark){svg,image{filter:invert(")
-    assert content().decode() == text
 
 
 def test_the_evaluation_is_drawn_where_it_was_played():
@@ -63,17 +46,6 @@ def test_the_evaluation_is_drawn_where_it_was_played():
     assert one.get_ylim() == other.get_ylim()
     assert one.get_ylim()[0] == -2.5
     assert "random" in lines(other)
-
-
-def test_episodes_of_a_team_are_not_drawn_beside_those_of_a_robot_alone():
-    figure = result_plots.rewards(
-        {"team": CURVES}, {"camera": AGENT, "lidar": {**AGENT, "optimal": 9.0}}
-    )
-    of_team, alone = map(lines, figure.axes)
-    assert set(of_team) == {"exploring"}
-    assert set(alone) == {"without exploration", "optimal", "naive", "random: -1.00, below"}
-    assert figure.axes[1].get_title() == "team: one camera robot alone on the map"
-    assert alone["optimal"].get_ydata()[0] == 4.5
 
 
 def test_curves_of_several_seeds_have_a_band():
@@ -110,29 +82,6 @@ def test_policies_stand_in_rows_by_their_time():
     (bar,) = by_time.collections
     ((low, high),) = bar.get_segments()
     assert (low.tolist(), high.tolist()) == ([52.0, 0.0], [58.0, 0.0])
-
-
-def test_every_arena_and_team_has_a_row_of_times():
-    def place(number, robots, seconds, side=3.0, episodes=8, **more):
-        times = {"latent": seconds, "naive": seconds + 1, **more}
-        mission = {n: {"time_s": time, "episodes": episodes} for n, time in times.items()}
-        return {"num_pois": number, "side": side, "robots": robots.split(), "mission": mission}
-
-    found = [
-        place(16, "camera camera lidar lidar", 45.0, auction=40.0),
-        place(3, "camera lidar", 12.0),
-        place(8, "lidar lidar lidar", 99.0, side=9.0, episodes=7),  # fewer missions
-        place(8, "lidar lidar lidar", 50.0, side=9.0),
-    ]
-    (axes,) = result_plots.places(found).axes
-    assert [label.get_text() for label in axes.get_yticklabels()] == [
-        "3 PoIs in 3 m: 1 camera, 1 lidar",
-        "8 PoIs in 9 m: 3 lidar",
-        "16 PoIs in 3 m: 2 camera, 2 lidar",
-    ]
-    drawn = {name: np.transpose(line.get_data()).tolist() for name, line in lines(axes).items()}
-    assert drawn["latent"] == [[12, 0], [50, 1], [45, 2]]
-    assert drawn["auction"] == [[40, 2]]
 
 
 def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
@@ -205,77 +154,3 @@ def test_classes_are_named_above_their_ellipses_and_seen_where_they_look_alike()
     for c, points in enumerate(each.get_offsets() for each in below.collections):
         np.testing.assert_allclose(points[:, 0], np.sqrt(0.5))
         assert np.abs(points[:, 1] - c).max() < 0.5
-
-
-def test_plots_of_sixteen_classes_have_room_for_all(recwarn):
-    paints = {"red": (0.8, 0.1, 0.1), "green": (0.1, 0.7, 0.1), "blue": (0.1, 0.1, 0.8)}
-    paints["grey"] = (0.5, 0.5, 0.5)
-    classes = tuple(f"{colour} {shape}" for colour in paints for shape in FOUR_SHAPES)
-    arena = ArenaConfig(shapes=FOUR_SHAPES, colours=paints, classes=classes)
-    config = replace(CONFIG, arena=arena, jmvae=replace(CONFIG.jmvae, latent_size=8))
-    sizes = {sensor.name: (16, sensor.window, sensor.channels) for sensor in sensors.make(config)}
-    windows = {name: np.full(size, 0.5) for name, size in sizes.items()}
-    # The fourth dimension shows the colour and the seventh the shape; a sensor knows one of them.
-    noise = 0.01 * np.random.default_rng(0).normal(size=(16, 9, 8))
-    colour, shape = np.zeros((16, 1, 8)), np.zeros((16, 1, 8))
-    colour[:, 0, 3], shape[:, 0, 6] = np.arange(16) // 4, np.arange(16) % 4
-    means = {"joint": colour + shape, "camera": colour, "lidar": shape}
-    of_all = {n: Belief(mean + noise, np.full((16, 9, 8), 0.3)) for n, mean in means.items()}
-    first = result_plots.scanlines(config, windows)
-    for figure in (first, latent_plots.latent_space(config, of_all)):
-        figure.draw_without_rendering()
-        width, height = figure.get_size_inches()
-        assert width < 16
-        for ax in figure.axes:
-            box = ax.get_position()
-            assert box.width * width > 2.0
-            assert box.height * height > (0.4 if figure is first else 2.0)
-    names = [{text.get_text() for text in ax.texts} for ax in figure.axes[:3]]
-    assert names[0] == set(classes)
-    assert names[1] == {f"{paint} cylinder\n{paint} cube\n2 more" for paint in paints}
-    assert [ax.get_xlabel() for ax in figure.axes[:3]] == ["latent dimension 4"] * 3
-    assert figure.axes[0].get_ylabel() == "latent dimension 7"
-    assert not recwarn.list
-
-
-ARENAS = {
-    "four alike": ArenaConfig(
-        shapes=FOUR_SHAPES, classes=("red post", "red slab", "red cube", "red cylinder")
-    ),
-    "two attributes": ArenaConfig(
-        attributes={
-            "temperature": Attribute({"cold": 30.0, "hot": 60.0}),
-            "gloss": Attribute({"dull": 0.0, "shiny": 1.0}),
-        },
-        classes=tuple(
-            f"{colour} {shape} {temperature} {gloss}"
-            for colour in ("red", "green")
-            for shape in ("cylinder", "cube")
-            for temperature in ("cold", "hot")
-            for gloss in ("dull", "shiny")
-        ),
-    ),
-}
-
-
-@pytest.mark.parametrize("arena", ARENAS.values(), ids=ARENAS)
-def test_every_class_has_a_colour_of_its_own(arena):
-    rgb = np.array([to_rgb(colours.class_colour(arena, label)) for label in arena.classes])
-    apart = np.linalg.norm(rgb[:, None] - rgb[None], axis=-1)[np.triu_indices(len(rgb), 1)]
-    assert apart.min() > 0.04  # 10 of 255
-
-
-def test_a_class_is_drawn_in_the_colour_of_its_pois_or_else_darker():
-    # (.1, .7, .1), (.8, .1, .1) and half of the latter.
-    found = [colours.class_colour(CONFIG.arena, label) for label in CONFIG.arena.classes]
-    assert found == ["#1ab21a", "#cc1a1a", "#660d0d"]
-
-
-def test_policies_and_other_curves_differ_in_colour_and_marker():
-    names = [*POLICIES, "my own"]
-    for style in (colours.policy_colour, colours.policy_marker):
-        assert len({style(name) for name in names}) == len(names)
-    styles = [colours.series(number) for number in range(len(POLICIES))]
-    for part in ("color", "marker"):
-        assert len({style[part] for style in styles}) == len(styles)
-    assert colours.series(len(POLICIES)) == styles[0]

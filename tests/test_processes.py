@@ -57,6 +57,7 @@ def test_two_processes_share_a_run(tmp_path):
     assert found["mission"]["naive"]["episodes"] == 4
 
 
+@pytest.mark.slow
 def test_a_process_without_a_device_is_refused_in_all_processes(tmp_path):
     out = tmp_path / "run"
     processes = two_processes(["--preset", "smoke", "--devices", "1", "--out", str(out)])
@@ -130,6 +131,7 @@ except ConnectionRefusedError:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="has one loopback address")
 def test_the_first_process_listens_at_its_address_alone():
     command = [sys.executable, "-c", LISTENS, str(free_port())]
@@ -137,13 +139,13 @@ def test_the_first_process_listens_at_its_address_alone():
     assert (ended.returncode, ended.stdout) == (0, "refused\n"), ended.stderr
 
 
-@pytest.mark.parametrize("index", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path, index):
+@pytest.mark.slow
+def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path):
     shared = ["--coordinator", f"localhost:{free_port()}", "--num-processes", "2"]
     command = [sys.executable, "-m", "jaxsense.train", "--cache", "None", "--preset", "smoke"]
     out = tmp_path / "run"
     process = subprocess.Popen(
-        [*command, *shared, "--process-index", str(index), "--out", str(out)],
+        [*command, *shared, "--process-index", "0", "--out", str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -11,8 +11,6 @@ from smoke import error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import evaluate, train
-from jaxsense.run import pipeline, rundir
-from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import read_settings
@@ -48,19 +46,6 @@ def test_a_seed_of_several_is_the_run_of_that_seed(seeds, smoke_run):
 
 
 @pytest.mark.slow
-def test_curves_are_those_of_all_seeds(seeds):
-    config = read_settings(seeds / "config.json").config
-    runs = [seeds / "seed-4", seeds / "seed-5"]
-    curves = rundir.rewards(runs, config, pytest.fail)
-    saved = {name: np.full(60, np.nan, np.float32) for name in ("reward", "evaluation", "epsilon")}
-    saved["seconds"] = np.zeros(3, np.float32)
-    of_5 = Checkpoints(seeds / "seed-5" / "checkpoints").load("curves_dqn_lidar", saved)
-    for name in ("reward", "evaluation"):
-        assert curves["lidar"][name].shape == (2, 60)
-        np.testing.assert_array_equal(curves["lidar"][name][1], of_5[name])
-
-
-@pytest.mark.slow
 def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
     summary = json.loads((seeds / "summary.json").read_text(encoding="utf-8"))
     each = [without_times(seeds / f"seed-{s}") for s in (4, 5)]
@@ -81,38 +66,6 @@ def test_the_summary_of_several_seeds_is_over_all_of_them(seeds, capsys):
         evaluate.main([str(seeds)])
     assert "holds several seeds; choose one" in capsys.readouterr().err
     assert "is finished" in error_line(["--resume", str(seeds)], capsys)
-
-
-@pytest.mark.slow
-def test_seeds_that_are_all_finished_are_only_summed_up(seeds, tmp_path, monkeypatch):
-    path = tmp_path / "seeds"
-    shutil.copytree(seeds, path)
-    (path / "summary.json").unlink()  # as if killed just before it was written
-    monkeypatch.setattr(pipeline, "learn", lambda *_: pytest.fail("trained again"))
-    train.main(["--resume", str(path), "--quiet", "--cache", "None"])
-    assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damage", ["altered", "missing", "all missing"])
-def test_seeds_are_summed_up_without_a_damaged_curve(seeds, tmp_path, capsys, damage):
-    path = tmp_path / "seeds"
-    shutil.copytree(seeds, path)
-    (path / "summary.json").unlink()
-    curve = path / "seed-4" / "checkpoints" / "curves_dqn_camera.msgpack"
-    if damage == "altered":
-        curve.write_bytes(curve.read_bytes()[:-1])
-    elif damage == "missing":
-        curve.unlink()
-    else:
-        for seed in (4, 5):
-            shutil.rmtree(path / f"seed-{seed}" / "checkpoints")
-    train.main(["--resume", str(path), "--quiet", "--cache", "None"])
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == (4 if damage == "all missing" else 1)
-    assert all("curves_dqn" in line and line.endswith("left out of reward.svg") for line in said)
-    assert (path / "summary.json").read_text() == (seeds / "summary.json").read_text()
-    assert (path / "reward.svg").exists()
 
 
 @pytest.mark.slow

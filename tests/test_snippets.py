@@ -12,12 +12,8 @@ import numpy as np
 import onnx
 import pytest
 from onnx import numpy_helper
-from smoke import save_models
 
-import jaxsense
 from jaxsense import PRESETS, export, train
-from jaxsense.recorded import comparing
-from jaxsense.run.rundir import RunDirectory, Settings
 
 ROOT = Path(__file__).parent.parent
 
@@ -27,8 +23,8 @@ def snippets(page):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, FUSION, SCORE = snippets("extending.md")
-PLAYED, RESAMPLED, LOOKS, COMPARED, RETRAINED, ARCHIVED = snippets("robot.md")
+PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, *_ = snippets("extending.md")
+PLAYED, RESAMPLED, LOOKS, _, RETRAINED, ARCHIVED = snippets("robot.md")
 
 
 @pytest.fixture
@@ -83,6 +79,7 @@ def recording():
         return importlib.import_module("recorded_scans").simulate(PRESETS["default"])
 
 
+@pytest.mark.slow
 def test_looks_fill_the_map(recording, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     np.savez("recorded.npz", **recording)
@@ -98,33 +95,6 @@ def test_looks_fill_the_map(recording, tmp_path, monkeypatch, capsys):
     assert len(belief) == len(config.arena.classes)
 
 
-def test_a_fusion_reads_class_probabilities(capsys):
-    found = run(FUSION)
-    assert len(capsys.readouterr().out.splitlines()) == 3
-    probabilities = found["models"].fusion.class_probabilities(found["belief"])
-    assert np.isclose(probabilities.sum(), 1)
-
-
-@pytest.mark.slow  # compiles missions of five policies
-def test_a_policy_is_scored_in_missions(capsys):
-    run(SCORE)
-    rows = re.findall(r"^  (\w+) +[01]\.\d{3} ", capsys.readouterr().out, re.MULTILINE)
-    assert rows == ["widest", "latent", "auction", "naive", "random"]
-
-
-@pytest.mark.slow  # simulates the windows of both sensors to compare with
-def test_recorded_scans_are_compared(recording, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(comparing, "NUM_SIMULATED", 24)
-    np.savez("recorded.npz", **recording)
-    config = PRESETS["smoke"]
-    with RunDirectory.create(tmp_path / "runs" / "first", Settings("smoke", 0, config)) as created:
-        save_models(created, jaxsense.init(jax.random.key(0), config))
-    run(COMPARED)
-    printed = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in printed] == ["camera", "lidar"]
-
-
 def test_an_archive_reads_scans(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     export.main(["pretrained:noisy", "--out", "robot.zip"])
@@ -134,6 +104,7 @@ def test_an_archive_reads_scans(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out == printed
 
 
+@pytest.mark.slow
 def test_a_detector_is_retrained_with_labelled_looks(recording, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     config = PRESETS["default"]

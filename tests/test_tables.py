@@ -32,13 +32,6 @@ def test_the_best_values_are_those_of_policies_about_as_accurate_as_the_best(oth
     assert tables.missions(played(latent=CASE, **cases), "").best == best
 
 
-def test_every_agent_must_have_the_papers_task():
-    camera = SUMMARY["dqn"]["camera"]
-    assert tables.paper(SUMMARY) is not None
-    other = {"camera": camera, "lidar": {**camera, "num_permutations": 200}}
-    assert tables.paper({**SUMMARY, "dqn": other}) is None
-
-
 def test_missions_are_compared_with_naive_exploration_where_it_was_played():
     naive = {**CASE, "time_s": 15.0, "ended": {"time limit": 1, "undetected": 2}}
     table = tables.missions(played(latent=CASE, naive=naive), "")
@@ -47,12 +40,6 @@ def test_missions_are_compared_with_naive_exploration_where_it_was_played():
     assert table.rows[1][1][-1] == "1\u00a0time\u00a0limit, 2\u00a0undetected"
     assert {"against naive", "unfinished", "in bold"} <= set(table.meanings)
     assert "against naive" not in tables.missions(played(latent=CASE), "").meanings
-
-
-def test_policies_have_the_names_that_users_type():
-    block = played(latent=CASE, naive_2=CASE, camera_alone=CASE)
-    assert [name for name, _ in tables.missions(block, "").rows] == ["latent", "naive_2"]
-    assert [name for name, _ in tables.failures(block).rows] == ["camera_alone"]
 
 
 def test_every_metric_of_missions_is_shown_for_who_has_it():

@@ -14,7 +14,7 @@ from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import init, make_in_place, make_jmvae
-from jaxsense.vae import detectors, filter, jmvae, prior
+from jaxsense.vae import detectors, jmvae
 
 CONFIG = Config(
     detector=DetectorConfig(hidden=(2,), steps=3, batch=4),
@@ -90,17 +90,6 @@ def together():
     return jax.jit(jax.vmap(train))(jnp.array(np.stack(rows), jnp.float32))
 
 
-def test_the_table_has_all_numbers_of_learning_that_may_be_traced():
-    leaves = jax.tree_util.tree_leaves_with_path(CONFIG)
-    names = {".".join(part.name for part in path if hasattr(part, "name")) for path, _ in leaves}
-    learning = {
-        name for name in names if name.partition(".")[0] in ("detector", "jmvae", "mdp", "dqn")
-    }
-    # The first are several numbers, and the second needs a filter.
-    others = {"jmvae.reconstruction_weights", "mdp.look_cost"}
-    assert set(VALUES) == learning - others
-
-
 @pytest.mark.slow
 def test_all_settings_together_do_what_the_constants_do(together):
     second = {name: values[1] for name, values in VALUES.items()}
@@ -109,6 +98,7 @@ def test_all_settings_together_do_what_the_constants_do(together):
     chex.assert_trees_all_close(here, alone, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VALUES)
 def test_each_setting_changes_its_training_and_no_other(together, name):
     place, part = list(VALUES).index(name), name.partition(".")[0].replace("mdp", "dqn")
@@ -120,27 +110,6 @@ def test_each_setting_changes_its_training_and_no_other(together, name):
         }
         assert differ.pop(part) > 1e-3
         assert max(differ.values()) < 1e-6
-
-
-@pytest.mark.slow
-def test_the_cost_of_a_look_may_be_traced():
-    with_filter = dataclasses.replace(CONFIG.jmvae, fusion="filter")
-    model, keys = make_jmvae(CONFIG), jax.random.split(jax.random.key(0), 4)
-    classes = Belief(jax.random.normal(keys[0], (3, 2)), jnp.full((3, 2), 0.2))
-    begin = jax.jit(lambda key: filter.init(key, model, classes, prior(model, 20.0)))
-    models = dataclasses.replace(init(keys[1], CONFIG), fusion=begin(keys[1]))
-    bank = (jnp.full((3, 1, 2), 0.5),) * 2
-
-    def rewarded(cost):
-        settings = MdpConfig(reward="nats", look_cost=cost)
-        config = dataclasses.replace(CONFIG, jmvae=with_filter, mdp=settings)
-        mdp = make_mdp(config, models, Bank(bank))
-        start = dqn.reset(keys[2], mdp)
-        return dqn.step(keys[3], mdp, start, jnp.int32(0), 0)[1].reward
-
-    free, dear = jax.jit(jax.vmap(rewarded))(jnp.array([0.0, 0.25]))
-    assert free - dear == pytest.approx(0.25, abs=1e-6)
-    assert jax.jit(lambda: rewarded(0.25))() == pytest.approx(float(dear), abs=1e-5)
 
 
 def test_weights_of_reconstruction_may_be_traced():

@@ -1,15 +1,12 @@
 """The command `train`, run as a user runs it: in-process, with the smoke preset."""
 
-import contextlib
 import dataclasses
 import json
 import re
-import sys
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -17,9 +14,8 @@ from smoke import MISSION_KEYS, SMOKE, error_line
 from untrained import untrained
 
 import jaxsense
-from jaxsense import evaluate, export, summary, train
+from jaxsense import summary, train
 from jaxsense.config import PRESETS, Config, Shape
-from jaxsense.run.compilation import Program
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import drawing
 
@@ -69,30 +65,6 @@ def test_summary_keeps_its_contract(smoke_run):
     told = found["mission"]["bytes_per_detection"]
     assert (told["latent"], told["features"]) == (16, 8)
     assert 1920 <= told["raw"] <= 2732
-
-
-def test_a_run_of_smoke_ends_by_saying_what_it_is_good_for(smoke_run, monkeypatch, capsys):
-    run = RunDirectory(smoke_run, Settings("smoke", 5, PRESETS["smoke"]))
-    monkeypatch.setattr(train, "_open", lambda arguments: contextlib.nullcontext(run))
-    monkeypatch.setattr(train, "_train", lambda *inputs: None)  # it is trained
-    train.main(["--preset", "smoke", "--seed", "5"])
-    *told, where, following = capsys.readouterr().out.splitlines()
-    only = "Preset smoke only checks that everything runs: its policies are not meant to be good."
-    assert only in told
-    assert only in (smoke_run / "report.html").read_text()
-    assert where == f"Results are in {smoke_run}. Start with {smoke_run / 'report.html'}."
-    assert following == f"Next: python -m jaxsense.evaluate {smoke_run} --animate"
-
-
-def test_the_time_of_a_run_covers_its_stages(smoke_run):
-    timing = json.loads((smoke_run / "summary.json").read_text())["timing"]
-    written = [(smoke_run / name).stat().st_mtime for name in ("config.json", "summary.json")]
-    # The page is written after the time is taken.
-    assert 0.8 * (written[1] - written[0]) <= timing["total_s"] <= written[1] - written[0] + 5
-    assert {"detector_camera", "jmvae", "dqn", "mission"} <= set(timing["stages"])
-    for stage in timing["stages"].values():
-        assert 0 < stage["run_s"] < timing["total_s"]
-        assert stage["compile_s"] > 0
 
 
 def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
@@ -151,61 +123,6 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
 
 
-# Trains as far as the JMVAE; `test_loop` stops at NaN, `test_bad_commands` reads what is printed.
-@pytest.mark.slow
-def test_training_that_turns_non_finite_stops_and_keeps_what_was_written(
-    cache, tmp_path, capsys, monkeypatch
-):
-    run = Program.__call__
-
-    def poisoned(self, *args):
-        output = run(self, *args)
-        if (self._stage, self._name) != ("jmvae", "advance"):
-            return output
-        state, progress = output
-        return state, dataclasses.replace(progress, loss=progress.loss.at[4].set(jnp.nan))
-
-    monkeypatch.setattr(Program, "__call__", poisoned)
-    out = tmp_path / "broken"
-    line = error_line([*SMOKE, *cache, "--out", str(out)], capsys)
-    assert "jmvae_1: loss = nan at step 5 of 300" in line
-    assert str(out) in line
-    assert (out / "checkpoints" / "detector_camera.msgpack").exists()
-    assert (out / "config.json").exists()
-    assert not (out / "summary.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        (
-            ["--preset", "best"],
-            "preset = 'best': must be one of default, paper, noisy, many, raw, team, recorded, "
-            "smoke",
-        ),
-        (["--taste", "sweet"], "train: unknown option --taste; see --help-all"),
-        (["--jmvae.hiden", "3"], "unknown option --jmvae.hiden; did you mean --jmvae.hidden?"),
-        (["--arena.side", "x"], "arena.side = 'x': must be a number"),
-        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
-        (["--seed", "one"], "seed = 'one': must be a whole number"),
-        (["--dqn.num-envs", "-4"], "dqn.num_envs = -4: must be at least 1"),
-        (["--dqn.observe", "ideal"], "'ideal'"),
-        (["--jmvae.hidden", "64", "0"], "jmvae.hidden = (64, 0): must have 1 or more values"),
-        (["--jmvae.beta", "nan"], "jmvae.beta = nan: must be a number"),
-        (["--modalities"], "modalities = (): must have 1 to 8 values"),
-        (["--modalities", "sonar"], "modalities = ('sonar',): must be among camera, lidar"),
-        (["--arena.num-pois", "50"], "arena.num_pois = 50: must be at most"),
-        (["--arena.classes", "pink cube", "red cube"], "'pink cube' must be"),
-        (["--dqn.replay-capacity", "1000"], "dqn.replay_capacity = 1000: must be a multiple of"),
-        (["--lidar.window", "700"], "lidar.window = 700: must be at most 683: it has 683 rays"),
-    ],
-)
-def test_bad_options_are_named_in_one_line(argv, expected, capsys, tmp_path):
-    out = tmp_path / "out"
-    assert expected in error_line([*argv, "--out", str(out)], capsys)
-    assert not out.exists()
-
-
 def help_of(argv, program, capsys, monkeypatch):
     """The help of a program on a terminal of 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
@@ -213,25 +130,6 @@ def help_of(argv, program, capsys, monkeypatch):
         program.main(argv)
     assert stop.value.code == 0
     return capsys.readouterr().out
-
-
-def test_help_shows_common_options_on_a_page(capsys, monkeypatch):
-    text = help_of(["--preset", "paper", "--help"], train, capsys, monkeypatch)
-    lines = text.splitlines()
-    assert len(lines) <= 70
-    assert max(map(len, lines)) <= 80
-    assert "--jmvae.alpha NUMBER" in text
-    assert "(default: 1.0)" in text  # of the preset
-    assert "epsilon" not in text
-    assert "None" not in text
-
-
-@pytest.mark.parametrize("program", [evaluate, export])
-def test_help_of_other_commands_fits_the_terminal(program, capsys, monkeypatch):
-    text = help_of(["-h"], program, capsys, monkeypatch)
-    assert text.startswith(f"usage: python -m {program.PROGRAM} [OPTIONS] RUN\n")
-    assert max(map(len, text.splitlines())) <= 80
-    assert "None" not in text
 
 
 def test_all_help_explains_every_field(capsys, monkeypatch):
@@ -271,14 +169,6 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert (again.seed, again.preset, again.config.robots) == (7, "smoke", None)
     assert again.config.arena == dataclasses.replace(config.arena, side=5.0)
     assert resumed.settings == Settings("smoke", 7, config)
-
-
-def test_tensorboard_is_refused_before_anything_is_written(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    out = tmp_path / "run"
-    line = error_line([*SMOKE, "--tensorboard", "--out", str(out)], capsys)
-    assert "tensorboard = True: needs tensorboardX: pip install" in line
-    assert not out.exists()
 
 
 def test_every_setting_has_a_sentence_of_help():

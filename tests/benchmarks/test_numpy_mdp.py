@@ -70,11 +70,3 @@ def test_starts_write_looks_in_rotated_order(task, first):
             seen = seen.at[modality].set(True)
         np.testing.assert_allclose(state.mean[poi], belief.mean, atol=TOLERANCE)
         np.testing.assert_allclose(state.std[poi], belief.std, atol=TOLERANCE)
-
-
-def test_starts_have_fair_coins(task):
-    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
-    rng = np.random.default_rng(0)
-    seen = np.array([theirs.reset(rng).seen for _ in range(400)])
-    # 2,400 fair coins: three standard deviations are 0.031.
-    assert abs(seen.mean() - 0.5) < 0.031

@@ -57,13 +57,3 @@ def runs(tmp_path):
 def test_a_table_shows_ranges_over_seeds(runs, capsys):
     presets.main(runs)
     assert capsys.readouterr().out == EXPECTED
-
-
-@pytest.mark.parametrize(("argv", "expected"), [([], "runs = ()"), (["."], "is not finished")])
-def test_what_is_no_run_is_one_line(argv, expected, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        presets.main(argv)
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert expected in line

@@ -3,8 +3,6 @@
 import dataclasses
 import functools
 import json
-import os
-import pickle
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +50,7 @@ def test_our_dqn_trains_in_every_kind_of_task(name, monkeypatch):
     assert not draws(policies[20], name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_learners_of_rejax_train_and_ppo_draws_its_actions(number, monkeypatch):
     rejax = peer("rejax", "rejax")
@@ -61,6 +60,7 @@ def test_learners_of_rejax_train_and_ppo_draws_its_actions(number, monkeypatch):
     assert [draws(policies[seed], "map-v0") for seed in (20, 21)] == [number == 1] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_learners_of_stable_baselines3_train_and_ppo_draws_its_actions(number, monkeypatch):
     sb3 = peer("sb3", "stable_baselines3")
@@ -140,17 +140,6 @@ class Nop:
         return {seed: Partial(nop) for seed in reversed(seeds)}
 
 
-@dataclasses.dataclass(frozen=True)
-class Elsewhere(Nop):
-    """Learns nothing, in a process other than this one."""
-
-    def train(self, task, seeds, steps):
-        assert os.getpid() != self.process
-        assert not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) == 1
-        assert jax.config.jax_default_matmul_precision == "highest"
-        return super().train(task, seeds, steps)
-
-
 def test_a_row_holds_all_seeds_and_its_origin():
     row = scoreboard.Job("map-v0", "camera", Nop(7), range(3), 64, "python -m x").do()
     assert row["returns"] == [0.0, 0.0, 0.0]
@@ -158,23 +147,6 @@ def test_a_row_holds_all_seeds_and_its_origin():
     assert (row["settings"], row["steps"]) == ({"process": 7}, 64)
     assert row["about"]["command"] == "python -m x"
     json.dumps(row, allow_nan=False)
-
-
-@pytest.mark.slow  # a new process imports everything
-def test_jobs_are_done_in_processes_of_their_own(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(scoreboard, "learners", lambda: (Elsewhere(os.getpid()),))
-    file = tmp_path / "tasks.json"
-    scoreboard.main(["nop", "--only", "map-v0", "--seeds", "2", "--quick", "--json", str(file)])
-    (row,) = json.loads(file.read_text())
-    assert (row["policy"], row["steps"], row["returns"]) == ("nop", 1, [0.0, 0.0])
-    assert row["about"]["command"].startswith("python -m benchmarks.scoreboard nop --only map-v0")
-    assert capsys.readouterr().out.strip() == scoreboard.tables([row])
-
-
-def test_learners_have_names_of_their_own_and_travel_to_other_processes():
-    found = scoreboard.learners()
-    assert len({each.name for each in found}) == len(found)
-    assert pickle.loads(pickle.dumps(found)) == found
 
 
 def test_tables_show_what_learners_reach():
@@ -189,16 +161,3 @@ def test_tables_show_what_learners_reach():
     ]
     assert lines[6] == "### `many-v0`, `camera`"
     assert lines[-1].startswith("| mine | 1.000 (0.")
-
-
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        (["none"], "learners = ('none',): must be some of our DQN"),
-        (["--only", "map-v1"], "only = ('map-v1',): must be some of many-v0, map-v0"),
-    ],
-)
-def test_wrong_options_are_told_in_one_line(argv, message, capsys):
-    with pytest.raises(SystemExit):
-        scoreboard.main(argv)
-    assert message in capsys.readouterr().err

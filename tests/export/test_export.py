@@ -87,13 +87,3 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     assert re.search(expected, error_line(argv, capsys, export))
     assert existing.read_text() == "precious"
     assert list(tmp_path.iterdir()) == [existing]
-
-
-def test_an_export_that_is_stopped_leaves_nothing(run, tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(export, "archive", stop)
-    with pytest.raises(KeyboardInterrupt):
-        export.main([str(run), "--out", str(tmp_path / "x.zip")])
-    assert not [*tmp_path.iterdir()]

@@ -22,8 +22,8 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 import jaxsense
 from jaxsense.config import ConfigError
 from jaxsense.dqn import map_mdp, observation
-from jaxsense.interfaces import common, prepared_starts
 from jaxsense.interfaces import gymnasium as ours
+from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
 
 LIDAR, NOP = 1, 3
@@ -184,6 +184,7 @@ def test_gymnasiums_own_check_passes_without_a_warning(name):
         check_env(gymnasium.make(f"jaxsense/{name}", render_mode="rgb_array").unwrapped)
 
 
+@pytest.mark.slow
 def test_pictures_show_what_changes():
     envs = gymnasium.make_vec("jaxsense/map-v0", num_envs=2, render_mode="rgb_array")
     assert envs.metadata["render_fps"] == 2
@@ -202,29 +203,6 @@ def test_pictures_show_what_changes():
     env.reset(seed=3)
     assert env.render().shape == (400, 800, 3)
     assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
-
-
-def test_a_forked_process_is_told_to_spawn(monkeypatch):
-    monkeypatch.setattr(common, "_processes", set())
-    env = gymnasium.make("jaxsense/map-v0")
-    monkeypatch.setattr(common.os, "getpid", lambda: -1)  # as in a process forked from this one
-    with pytest.raises(RuntimeError, match=r"was forked .*: start processes with spawn, as vector"):
-        env.reset(seed=0)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:os.fork", "ignore:.*ERROR")
-def test_asynchronous_environments_of_gymnasium_do_not_hang():
-    make_vec = functools.partial(
-        gymnasium.make_vec, "jaxsense/map-v0", 2, vectorization_mode="async"
-    )
-    envs = make_vec(vector_kwargs={"context": "fork"})
-    with pytest.raises(RuntimeError, match="was forked"):
-        envs.reset(seed=0)
-    envs.close(terminate=True)
-    envs = make_vec(vector_kwargs={"context": "spawn"})
-    assert envs.reset(seed=0)[0].shape == (2, 12)
-    envs.close()
 
 
 def test_what_cannot_be_is_told(make):

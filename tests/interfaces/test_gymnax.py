@@ -1,7 +1,6 @@
 """gymnax: parameters, prepared starts, batches and wrappers; `test_parity` has the steps."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import small
@@ -15,11 +14,8 @@ from gymnax.wrappers.gym import GymnaxToGymWrapper
 import jaxsense
 from jaxsense.dqn import observation
 from jaxsense.interfaces.gymnax import MapEnv
-from jaxsense.looks import make_mdp
-from jaxsense.models import init
 
 LIDAR, NOP = 1, 3
-SMOKE = jaxsense.PRESETS["smoke"]
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +52,6 @@ def test_prepared_starts_are_drawn_and_no_others(env, params):
     assert (distances.min(axis=0) == 0).all()
 
 
-def test_a_batch_equals_single_environments(env, params):
-    keys, actions = jax.random.split(jax.random.key(3), 4), jnp.arange(4)
-    _, states = jax.vmap(env.reset, (0, None))(keys, params)
-    together = jax.vmap(env.step, (0, 0, 0, None))(keys, states, actions, params)
-    for i in range(4):
-        alone = env.step(keys[i], jax.tree.map(lambda x: x[i], states), actions[i], params)  # noqa: B023
-        row = jax.tree.map(lambda x: x[i], together)  # noqa: B023
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), row, alone)
-
-
 def test_wrappers_of_gymnax_take_it(env, params):
     logged = purerl.LogWrapper(env)
     _, state = logged.reset(jax.random.key(0), params)
@@ -85,26 +71,8 @@ def test_every_task_is_registered(env):
     assert (env.name, env.num_actions) == ("jaxsense-Map", NOP + 1)
 
 
-@pytest.mark.slow
-def test_live_observations_trace():
-    def play(key):
-        env = MapEnv(make_mdp(SMOKE, init(key, SMOKE)).map, 0)
-        _, state = env.reset(key, env.default_params)
-        return env.step(key, state, 0, env.default_params)
-
-    obs, _, reward, *_ = jax.eval_shape(play, jax.random.key(0))
-    assert (obs.shape, reward.shape) == ((12,), ())
-
-
 @pytest.mark.parametrize("action", [1.7, np.array([0, 1])])
 def test_an_action_that_is_no_integer_is_refused(env, params, action):
     _, state = env.reset(jax.random.key(0), params)
     with pytest.raises(ValueError, match="action"):
         env.step(jax.random.key(1), state, action, params)
-
-
-@pytest.mark.parametrize("action", [2, np.uint8(2)])
-def test_integers_of_all_libraries_are_the_same_action(env, params, action):
-    _, state = env.reset(jax.random.key(0), params)
-    after = env.step_env(jax.random.key(1), state, action, params)[1]
-    assert after.map.seen[2, LIDAR]

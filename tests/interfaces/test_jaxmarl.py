@@ -1,15 +1,10 @@
 """jaxmarl: what its wrappers and its import do; `test_team` and `test_parity` have the steps."""
 
-import importlib
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import small
-
-import jaxsense.interfaces
 
 AGENTS, NOP = [*small.AGENTS], small.TEAM_NOP
 
@@ -58,34 +53,6 @@ def test_an_ended_episode_starts_again_in_the_same_step(env):
 
 
 @pytest.mark.slow
-def test_it_scans_in_a_batch_and_equals_one_alone(env):
-    def choose(key, state):
-        logits = {k: jnp.where(x, 0.0, -jnp.inf) for k, x in env.get_avail_actions(state).items()}
-        keys = jax.random.split(key, 3)
-        return {k: jax.random.categorical(keys[i], logits[k]) for i, k in enumerate(AGENTS)}
-
-    def step(carry, key):
-        choose_key, step_key = jax.random.split(key)
-        actions = choose(choose_key, carry[1])
-        after, state, rewards, dones, infos = env.step(step_key, carry[1], actions)
-        return (after, state), (after, rewards, dones, infos)
-
-    def play(key):
-        start_key, key = jax.random.split(key)
-        return jax.lax.scan(step, env.reset(start_key), jax.random.split(key, 24))[1]
-
-    keys = jax.random.split(jax.random.key(8), 4)
-    together, alone = jax.jit(jax.vmap(play))(keys), jax.jit(play)(keys[2])
-    third = jax.tree.map(lambda x: x[2], together)
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), third, alone)
-    observations, rewards, dones, infos = together
-    assert observations["lidar"].shape == (4, 24, 112)
-    assert infos["seconds"].shape == (4, 24, 3)
-    # 24 steps of at most 12 each: every environment ended at least once.
-    assert dones["__all__"].any(axis=1).all()
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves((observations, rewards)))
-
-
 def test_the_log_wrapper_sums_rewards(env):
     from jaxmarl.wrappers.baselines import LogWrapper
 
@@ -102,33 +69,8 @@ def test_the_log_wrapper_sums_rewards(env):
     assert (total != 0).all()
 
 
-def test_the_manager_of_rollouts_takes_masks_as_the_page_says(env):
-    from jaxmarl.wrappers.baselines import CTRolloutManager
-
-    manager = CTRolloutManager(env, batch_size=4)
-    _, states = manager.batch_reset(jax.random.key(10))
-    manager.get_valid_actions = jax.vmap(env.get_avail_actions)
-    # At first the first robot chooses, and the others have NOP alone.
-    for agent, mask in manager.get_valid_actions(states).items():
-        np.testing.assert_array_equal(mask[:, -1], True)
-        assert mask[:, :-1].any() == (agent == AGENTS[0])
-
-
 def test_a_robot_without_an_action_is_named(env):
     _, state = env.reset(jax.random.key(3))
     for actions in ({AGENTS[0]: 0}, [0, 0]):
         with pytest.raises(ValueError, match=r"actions = .*: must have one of each of"):
             env.step_env(jax.random.key(4), state, actions)
-
-
-@pytest.mark.usefixtures("env")  # which is skipped without jaxmarl
-def test_the_import_prints_nothing_and_keeps_streams(monkeypatch, capfd):
-    for name in list(sys.modules):
-        if name.partition(".")[0] == "jaxmarl" or name == "jaxsense.interfaces.jaxmarl":
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delattr(jaxsense.interfaces, "jaxmarl")
-    streams = sys.stdout, sys.stderr, sys.__stdout__
-    importlib.import_module("jaxsense.interfaces.jaxmarl")
-    found = sys.stdout, sys.stderr, sys.__stdout__
-    assert all(x is y for x, y in zip(found, streams, strict=True))
-    assert capfd.readouterr().out == ""

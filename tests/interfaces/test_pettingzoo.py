@@ -2,14 +2,12 @@
 
 import warnings
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import small
 
 pytest.importorskip("pettingzoo", reason="needs the extra jaxsense[pettingzoo]")
 
-from gymnasium.error import ResetNeeded
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 
 from jaxsense.interfaces.pettingzoo import TeamAECEnv, TeamParallelEnv, make, make_parallel
@@ -22,6 +20,7 @@ OWN = (
 TASK = lambda: make("team-v0"), lambda: make_parallel("team-v0")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("both", [TASK, pytest.param(OWN, marks=pytest.mark.slow)])
 def test_pettingzoos_own_tests_pass(both):
     turns, together = both
@@ -69,24 +68,6 @@ def test_turns_are_the_steps_of_the_parallel_environment():
     assert turns.agents == together.agents == []
     # Whoever is asked gets all that it has earned since its last turn.
     assert earned == pytest.approx(totals)
-
-
-def test_a_turn_takes_actions_of_its_robot_only():
-    turns = OWN[0]()
-    with pytest.raises(ResetNeeded):
-        turns.step(0)
-    turns.reset(seed=0)
-    for action in (9, -1, 0.5, None):
-        with pytest.raises(ValueError, match=rf"action = {action}: must be in Discrete"):
-            turns.step(action)
-    for agent, kind in zip(AGENTS, (int, np.uint8, jnp.int32), strict=True):
-        assert turns.agent_selection == agent
-        turns.step(kind(NOP))
-        assert turns.terminations[agent]
-        # First it leaves.
-        turns.step(None)
-    with pytest.raises(ResetNeeded, match="after the end"):
-        turns.step(0)
 
 
 def test_seeds_repeat_and_differ():

@@ -11,6 +11,7 @@ import rejax
 from jaxsense.interfaces.rejax import MapEnv
 
 
+@pytest.mark.slow
 def test_its_dqn_learns():
     env = MapEnv(small.small_mdp(), 0)
     algorithm = rejax.DQN.create(

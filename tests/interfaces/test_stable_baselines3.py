@@ -20,6 +20,7 @@ def env():
     return MapVecEnv(make_vec("map-v0", 4, starts=64, autoreset_mode="SameStep"))
 
 
+@pytest.mark.slow
 def test_its_dqn_learns(env):
     torch.set_num_threads(1)  # faster than two for networks of this size
     model = sb3.DQN(
@@ -72,8 +73,3 @@ def test_attributes_are_those_of_the_whole_and_masks_those_of_each():
     np.testing.assert_array_equal(env.env_method("action_masks", indices=[2, 5]), masks[[2, 5]])
     env.env_method("close", indices=0)
     assert env.get_attr("closed", [0]) == [True]
-
-
-def test_only_episodes_that_start_again_in_the_same_step_are_taken():
-    with pytest.raises(ValueError, match=r"autoreset_mode = .*must be AutoresetMode\.SAME_STEP"):
-        MapVecEnv(make_vec("map-v0", 2))

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 import small
 
-import jaxsense
-from jaxsense.config import ConfigError
 from jaxsense.dqn import team_mdp
-from jaxsense.interfaces import common
 from jaxsense.interfaces.common import robots_of
 
 AGENTS, NOP = small.AGENTS, small.TEAM_NOP
@@ -131,19 +128,3 @@ def test_actions_that_do_not_exist_are_refused_or_reward_nan(robots, action):
         for _ in AGENTS:  # the first look comes after all have chosen
             state, found, _ = step(jax.random.key(4), robots, state, jnp.full(3, action))
         assert np.isnan(found.reward).any()
-
-
-def test_what_is_no_team_is_named():
-    with pytest.raises(ConfigError, match="name = 'map-v0': must be a task of a team"):
-        robots_of("map-v0")
-    with pytest.raises(ValueError, match="config: must be None with a task"):
-        robots_of(jaxsense.make("team-v0"), jaxsense.PRESETS["team"])
-    # In another order a robot would carry another's sensor.
-    other = dataclasses.replace(small.team(), modalities=("lidar", "camera"))
-    jmvae = dataclasses.replace(small.TEAM.jmvae, reconstruction_weights=(10.0,))
-    one = {"modalities": ("camera",), "robots": ("camera",), "jmvae": jmvae}
-    cameras = dataclasses.replace(small.TEAM, **one)
-    for mdp, config in ((small.team(), cameras), (other, small.TEAM), (small.team().map, cameras)):
-        with pytest.raises(ValueError, match=r"mdp = .*MapMdp|TeamMdp .*: must be a TeamMdp with"):
-            robots_of(mdp, config)
-    assert common.robots_of("team-v0").names == ("camera", "lidar")

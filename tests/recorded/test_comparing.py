@@ -7,15 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import recorded, sim
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.recorded import comparing
 
 SMOKE = PRESETS["smoke"]
 # Without noise, the error of the bearing alone tells windows apart.
 EXACT = replace(SMOKE, lidar=replace(SMOKE.lidar, range_noise=0.0))
-CONFIG = replace(SMOKE, arena=replace(SMOKE.arena, side=4.0))
-CYLINDER, CUBE = 0, 2
 
 
 @pytest.fixture(scope="module")
@@ -67,61 +64,3 @@ def test_root_mean_squares_are_of_the_rays_at_the_poi():
     residuals = jnp.array([[jnp.nan, 0.3, -0.4, jnp.nan], [0.2, 0.2, 0.2, 0.2]])
     # sqrt((.09 + .16) / 2), sqrt(.04).
     np.testing.assert_allclose(comparing.root_mean_square(residuals), [0.125**0.5, 0.2], rtol=1e-6)
-
-
-def simulated(number=8):
-    """A simulated recording by both sensors."""
-    world = sim.make_world(CONFIG)
-
-    @jax.jit
-    @jax.vmap
-    def record(key):
-        scene_key, *keys = jax.random.split(key, 3)
-        scene = sim.random_scene(scene_key, world, jnp.array([0, 1, 2]))
-        found = {"places": scene.layout.position[0]}
-        for m, sensor in enumerate(world.sensors):
-            look_key, noise_key = jax.random.split(keys[m])
-            _, scene = sim.look(look_key, world, scene, m, jnp.int32(0))
-            data, rays = sim.place(world.arena, scene.layout, scene.poses), sensor.directions
-            found[f"{sensor.name}_scans"] = sim.scan(
-                noise_key, sensor, world.arena, data, scene.layout, scene.light, m, jnp.array(rays)
-            )
-            found[f"{sensor.name}_poses"] = scene.poses[m]
-        return found
-
-    found = record(jax.random.split(jax.random.key(1), number))
-    return {name: np.array(values) for name, values in found.items()}
-
-
-@pytest.mark.slow
-def test_recordings_are_compared_with_simulated_windows(monkeypatch):
-    monkeypatch.setattr(comparing, "NUM_SIMULATED", 24)
-    content = simulated()
-    scans, poses = (
-        {name: content[f"{name}_{part}"] for name in CONFIG.modalities}
-        for part in ("scans", "poses")
-    )
-    found = recorded.compare(CONFIG, recorded.RecordedLooks(content["places"], poses, scans))
-    assert [*found] == ["camera", "lidar"]
-    apart = {
-        n: [np.median(comparing.root_mean_square(x)) for x in (f.residuals, f.usual)]
-        for n, f in found.items()
-    }
-    for name, (recording, usual) in apart.items():
-        # A simulated recording is as far from simulated windows as they are from each other.
-        assert len(found[name].recorded) == 8
-        assert 0 < recording < 1.5 * usual
-    # Each beam is off by .01 m, and so is each of the windows that it is compared with.
-    assert apart["lidar"][0] == pytest.approx(0.0125, abs=0.003)
-    assert str(found["lidar"]).startswith("8 recorded windows are 0.01")
-
-    # Another scanner is too far by .2 m, and the last three looks are behind the robot.
-    far, turned = {"lidar": scans["lidar"] + 0.2}, {"lidar": poses["lidar"].copy()}
-    turned["lidar"][-3:, 2] += np.pi
-    looks = recorded.RecordedLooks(content["places"], turned, far)
-    found = recorded.compare(CONFIG, looks)["lidar"]
-    assert len(found.recorded) == 5
-    assert 0.13 < np.median(comparing.root_mean_square(found.residuals)) < 0.22
-    turned["lidar"][:-3, 2] += np.pi
-    with pytest.raises(ValueError, match="lidar_scans: no window around a PoI was recorded"):
-        recorded.compare(CONFIG, looks)

@@ -44,18 +44,3 @@ def test_residuals_are_those_of_straight_walls():
         with np.errstate(all="ignore"):
             found, _ = noises._wall_residuals(ANGLES[90:105], other[None])
         assert len(found) == 0
-
-
-def test_a_scan_narrower_than_a_piece_of_wall_is_refused():
-    with pytest.raises(ValueError, match="number of angles = 14: must be at least 15"):
-        recorded.fit_noise(LidarConfig(), ANGLES[:14], np.ones((1, 14)))
-
-
-def test_too_few_scans_to_fit_the_noise_to_are_named():
-    expected = "scans show 0 pieces of walls, 20 or more of them in 0 bins of half a metre: must be"
-    with pytest.raises(ValueError, match=expected):
-        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), np.inf, np.float32))
-    # A round room has all of its walls at one distance.
-    expected = "pieces of walls, 20 or more of them in 1 bins"
-    with pytest.raises(ValueError, match=expected):
-        recorded.fit_noise(LidarConfig(), ANGLES, np.full((3, 361), 2.2, np.float32))

@@ -71,20 +71,6 @@ def test_a_distance_of_0_is_no_return(write):
         np.testing.assert_allclose(np.unique(windows[1]), [1.0, float(LIDAR.window_limit)])
 
 
-def test_gaps_of_lost_beams_are_closed_as_on_robots(write):
-    for angles in (None, HALF_CIRCLE):
-        scans = np.full((3, 683 if angles is None else 361), 1.0)
-        whole = recorded.read(CONFIG, write(lidar_scans=scans, lidar_angles=angles))
-        for lost in (np.inf, 0.0):
-            scans[:, 60:300:40] = lost
-            looks = recorded.read(CONFIG, write(lidar_scans=scans, lidar_angles=angles))
-            np.testing.assert_array_equal(looks.scans["lidar"], whole.scans["lidar"])
-        scans[:, 60:300:40] = np.nan  # not recorded
-        looks = recorded.read(CONFIG, write(lidar_scans=scans, lidar_angles=angles))
-        new = np.isnan(looks.scans["lidar"]) & ~np.isnan(whole.scans["lidar"])
-        assert new.any(axis=1).all()
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

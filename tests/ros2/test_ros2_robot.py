@@ -25,16 +25,6 @@ def test_scans_of_other_numbers_of_beams_are_resampled(ros2, robot, stub):
     np.testing.assert_allclose(stub.asked[0]["readings"], 1 + 0.001 * np.degrees(OWN), rtol=1e-5)
 
 
-def test_lost_beams_take_the_distance_of_their_neighbours(ros2, robot, stub):
-    ranges = np.linspace(1, 3, 9)
-    see(ros2, robot, arrive(robot), OWN, np.where(np.arange(9) == 4, np.inf, ranges))
-    np.testing.assert_allclose(stub.asked[0]["readings"][[3, 4, 5]], ranges[[3, 3, 5]], rtol=1e-5)
-    # Beams that were not recorded are not numbers.
-    robot.goal, robot.target = robot._last_pose, 0
-    see(ros2, robot, robot.goal, OWN[:5], np.ones(5))
-    np.testing.assert_array_equal(stub.asked[1]["readings"], [1] * 5 + [np.nan] * 4)
-
-
 @pytest.mark.parametrize(
     ("degrees", "expected"),
     [
@@ -140,19 +130,6 @@ def test_a_look_updates_the_map_and_the_next_choice_is_new(ros2, robot):
     assert 0.5 <= np.linalg.norm(again[:2] - goal[:2]) < 0.9
 
 
-def test_a_robot_under_way_keeps_its_viewpoint_unless_it_changes_its_mind(robot, stub):
-    goal = arrive(robot)
-    look = {"poi": 2, "features": [0.75, 0.25], "weight": 1.0, "place": [-1.1, 0.0]}
-    robot.write(0, look)
-    assert arrive(robot, (0.2, 0.3, 0.0)) is goal
-    robot.write(0, look)
-    stub.choices = [1, 3]
-    np.testing.assert_allclose(arrive(robot), [0, 1.1, math.pi / 2], atol=1e-6)
-    # No news, no choice.
-    stub.choices = [3]
-    assert arrive(robot) is not None
-
-
 @pytest.mark.parametrize("is_known", [True, False])
 def test_after_failures_elsewhere_a_poi_is_given_up(ros2, robot, stub, is_known):
     stub.detects, stub.is_known, said = False, is_known, []
@@ -170,16 +147,6 @@ def test_after_failures_elsewhere_a_poi_is_given_up(ros2, robot, stub, is_known)
     assert robot.known["seen"].sum() == 0
     why = "nothing detected of" if is_known else "outside of what was learned:"
     assert said[:2] == [f"{why} PoI 0, 0.90 m away", "failure 1 of 3 at PoI 0"]
-
-
-def test_a_poi_that_is_seen_from_everywhere_is_given_up(robot, stub):
-    stub.weigh = lambda apart: {"weight": 0.4}
-    robot.programs = stub.programs()
-    assert arrive(robot) is None
-    assert robot.is_done
-    assert '"works": false' in robot.report()
-    robot.fail(np.zeros(3))
-    assert not robot.team["present"].any()
 
 
 @pytest.mark.parametrize(

@@ -4,17 +4,12 @@ import copy
 import json
 import math
 import re
-import sys
-from pathlib import Path
-from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ros2_robot import CONTENTS, OWN, POSITIONS, arrive, see
-from test_ros2_readings import scan_of
+from ros2_robot import CONTENTS, POSITIONS, arrive, see
 
 import jaxsense
 from jaxsense import export, sim
@@ -69,84 +64,6 @@ def test_a_message_that_is_no_report_changes_nothing(robot, change, reason):
     with pytest.raises(ValueError, match=re.escape(reason)):
         robot.hear(1.0, report)
     jax.tree.map(np.testing.assert_array_equal, (robot.team, robot.known, robot.heard_at), before)
-
-
-@pytest.fixture
-def node(monkeypatch):
-    """A node of `rclpy`, for which the packages of ROS are stand-ins."""
-    for name in ("geometry_msgs", "rclpy", "sensor_msgs", "std_msgs", "tf2_ros"):
-        for part in ("", ".duration", ".msg", ".qos", ".time"):
-            monkeypatch.setitem(sys.modules, name + part, MagicMock())
-    sys.modules["rclpy.time"].Time.from_msg.return_value.nanoseconds = 10**9
-    sys.modules["tf2_ros"].TransformException = OSError
-    node = MagicMock()
-    node.get_clock().now().nanoseconds = 10**9
-    return node
-
-
-def callback_of(node, topic):
-    given = (call.args for call in node.create_subscription.call_args_list)
-    (callback,) = (callback for _, each, callback, _ in given if each == topic)
-    return callback
-
-
-def test_a_coarse_scan_gets_one_line_and_no_goal(ros2, robot, node, monkeypatch):
-    monkeypatch.setattr(ros2, "pose_of", lambda *_: (np.zeros(3), False))
-    ros2.connect(node, robot)
-    on_scan, goals = callback_of(node, "scan"), node.create_publisher.return_value
-    goal = sys.modules["geometry_msgs.msg"].PoseStamped.return_value
-    for step, number in ((math.radians(35), 0), (OWN[1] - OWN[0], 1)):
-        header = {"angle_min": OWN[0], "angle_max": OWN[0] + 8 * step, "angle_increment": step}
-        on_scan(scan_of(np.ones(9), header=MagicMock(), **header))
-        assert goals.publish.call_count == number
-    (said,) = node.get_logger().error.call_args_list
-    assert "ignores the scans: step of beams = 35.00 degrees" in said.args[0]
-    assert (goal.pose.position.x, goal.pose.orientation.w) == pytest.approx((1.1, 1.0))
-    # It has not looked within a minute.
-    node.get_clock().now().nanoseconds = 62 * 10**9
-    on_scan(scan_of(np.ones(9), header=MagicMock(), **header))
-    logged = [call.args[0] for call in node.get_logger().info.call_args_list]
-    assert logged == ["has not looked within 60 s", "failure 1 of 3 at PoI 0"]
-    assert goals.publish.call_count == 2
-
-
-def test_the_node_hears_the_others_and_says_what_stands_where(ros2, robot, node):
-    tell, hear = ros2.join(node, robot, lambda: 1.0), callback_of(node, "team")
-    robot.known["mean"][1] = 0.75
-    string = sys.modules["std_msgs.msg"].String
-    tell()
-    (_, classes) = (json.loads(call.kwargs["data"]) for call in string.call_args_list[-2:])
-    assert classes == [{"a": 0.0, "b": 1.0}, {"a": 0.75, "b": 0.25}, {"a": 0.0, "b": 1.0}]
-    hear(SimpleNamespace(data="nonsense"))
-    (warned,) = node.get_logger().warning.call_args_list
-    assert "ignored a message on `team`: no report of a robot" in warned.args[0]
-    hear(SimpleNamespace(data=json.dumps(REPORT)))
-    assert robot.known["seen"][2, 0]
-    assert robot.heard_at[0] == 1
-
-
-def test_the_program_reads_its_command_before_it_needs_ros(ros2, monkeypatch, capsys, tmp_path):
-    given = []
-    monkeypatch.setitem(ros2.sys.modules, "rclpy", None)
-
-    def code_of(*argv):
-        monkeypatch.setattr(ros2.sys, "argv", ["ros2_node.py", *argv])
-        with pytest.raises(SystemExit) as stop:
-            ros2.main()
-        return stop.value.code
-
-    (text := tmp_path / "text.zip").write_text("no archive")
-    assert code_of(str(text), "--pois", "0,1") == 2
-    assert f"{text}: must be a file of `jaxsense export`" in capsys.readouterr().err
-    for poi in ("1.0", "1,2,3", "1;2", "-1"):
-        assert code_of("robot.zip", "--pois", poi, "0,1") == 2
-        assert "argument --pois: invalid point value" in capsys.readouterr().err
-    monkeypatch.setattr(ros2, "load", lambda archive: (archive, "programs"))
-    monkeypatch.setattr(ros2, "Robot", lambda *each: given.append(each))
-    pois, ros = ["1.0,0.5", "-1.2,0.8", "-.3,-1.1"], ["--ros-args", "-r", "scan:=/front/scan"]
-    ended = code_of("robot.zip", "--robot", "-1", "--pois", *pois, *ros)
-    assert ended == "needs ROS 2: source /opt/ros/.../setup.bash"
-    assert given == [(Path("robot.zip"), "programs", -1, [[1.0, 0.5], [-1.2, 0.8], [-0.3, -1.1]])]
 
 
 @pytest.mark.slow  # compiles scans in a simulated arena

@@ -4,7 +4,7 @@ import copy
 import json
 
 import pytest
-from summaries import CASE, EVALUATION, SUMMARY
+from summaries import SUMMARY
 
 from jaxsense import summary
 from jaxsense.config import ConfigError
@@ -49,20 +49,3 @@ def test_what_is_missing_or_wrong_is_named(tmp_path, place, value, reason):
     assert "must hold the summary.json of a finished run" in str(error.value)
     assert reason in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_evaluations_are_read_in_the_order_of_their_names(tmp_path):
-    assert summary.read_evaluations(tmp_path) == {}
-    for name in ("there", "here"):
-        written(tmp_path, EVALUATION, f"evaluations/{name}.json")
-    assert [*summary.read_evaluations(tmp_path).items()] == [
-        ("here", EVALUATION),
-        ("there", EVALUATION),
-    ]
-    before = {name: value for name, value in EVALUATION.items() if name != "origin"}
-    written(tmp_path, before, "evaluations/here.json")
-    assert summary.read_evaluations(tmp_path)["here"] == before
-    wrong = {**EVALUATION, "mission": {"latent": {**CASE, "time_s": None}}}
-    written(tmp_path, wrong, "evaluations/here.json")
-    with pytest.raises(ConfigError, match=r"must hold the evaluations/here\.json of a finished"):
-        summary.read_evaluations(tmp_path)
