@@ -1,6 +1,5 @@
 """The animated SVG, read as a viewer reads it."""
 
-import dataclasses
 import re
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -9,7 +8,6 @@ import numpy as np
 import pytest
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
 
-from jaxsense.core.types import Belief
 from jaxsense.show import film
 from jaxsense.show.svg import Timeline
 
@@ -200,15 +198,3 @@ def test_a_field_of_view_is_that_of_the_sensor():
         x, y = map(float, field.get("d").removeprefix("M0,0L").split("A")[0].split(","))
         assert x == pytest.approx(-side * y, abs=0.1)
         assert field.get("d").split()[1:3] == ["0", is_wide]
-
-
-def test_the_map_begins_with_the_prior_of_the_fusion():
-    prior = Belief(np.array([1.0, -0.5]), np.array([0.25, 0.5]))
-    ellipses, ring = beliefs(parse(draw(fusion=dataclasses.replace(FUSION, prior=prior))))
-    # The second PoI is seen later, and the ring of all that are unknown stays there.
-    first = {t.attribute: t.at(0.0)[0] for t in tracks(ellipses[1])}
-    scale = 170 / 2.4  # as above
-    expected = {"cx": 170 + scale, "cy": 170 + scale * 0.5, "rx": scale * 0.25}
-    for name, value in expected.items():
-        assert first[name] == pytest.approx(value, abs=0.1)
-        assert float(ring.get(name)) == pytest.approx(value, abs=0.1)

@@ -159,6 +159,7 @@ def two_processes(tmp_path_factory):
     return said, compiled
 
 
+@pytest.mark.slow
 def test_a_kept_program_finds_the_functions_that_it_calls(two_processes):
     # Only a new process has not bound them yet. [[2, 0], [1, 2]] times its transpose is the matrix.
     expected = "[[2.0, 0.0], [1.0, 2.0]]\n"

@@ -24,15 +24,6 @@ def run(path, directory, monkeypatch):
     return names
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_store_no_output(path):
-    content = json.loads(path.read_text(encoding="utf-8"))
-    assert (content["nbformat"], content["nbformat_minor"]) == (4, 5)
-    code = [cell for cell in content["cells"] if cell["cell_type"] == "code"]
-    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
-    assert len({cell["id"] for cell in content["cells"]}) == len(content["cells"])
-
-
 def notebook(name):
     return next(path for path in NOTEBOOKS if path.stem == name)
 

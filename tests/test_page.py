@@ -4,7 +4,6 @@ import html
 import inspect
 import re
 import shlex
-import shutil
 from xml.etree import ElementTree
 
 import jax
@@ -139,17 +138,6 @@ def test_a_film_is_drawn_whole_and_can_be_paused_without_a_script(run):
     frames = [re.findall("@keyframes.*", each.findtext(".//{*}style")) for each in (here, there)]
     assert frames[0] == frames[1]
     assert len(frames[0]) > 10
-
-
-def test_films_of_one_arena_play_together(run, tmp_path):
-    for name in ("mission", "mission-naive", "mission-naive-7"):
-        shutil.copy(run / "mission.svg", tmp_path / f"{name}.svg")
-    text = page.render(tmp_path, CONFIG, SUMMARY)
-    assert re.findall("<legend>([^:]*):", text) == [
-        "Animation mission, mission-naive",
-        "Animation mission-naive-7",
-    ]
-    assert re.findall(r'name="film-(\d)"', text) == ["1"] * 3 + ["2"] * 3
 
 
 def test_evaluations_have_tables_of_their_own(tmp_path):

@@ -48,42 +48,6 @@ def test_the_evaluation_is_drawn_where_it_was_played():
     assert "random" in lines(other)
 
 
-def test_curves_of_several_seeds_have_a_band():
-    two = {kind: np.stack([values, values + 2]) for kind, values in CURVES.items()}
-    (axes,) = result_plots.rewards({"camera": two}, {"camera": AGENT}).axes
-    np.testing.assert_array_equal(lines(axes)["without exploration"].get_ydata(), [2, 3, 4, 5])
-    assert len(axes.collections) == 2
-    nothing = {kind: np.zeros((0, 40)) for kind in CURVES}
-    result_plots.rewards({"camera": nothing}, {"camera": AGENT}).draw_without_rendering()
-
-
-def case(accuracy, looks, seconds, **more):
-    of_case = {"accuracy": accuracy, "observations_per_poi": looks, "mean_time_s": seconds}
-    return {**of_case, "episodes": 128, **more}
-
-
-def test_policies_stand_in_rows_by_their_time():
-    slower = {"mean": 15.0, "low": 12.0, "high": 18.0}
-    more = {"mean": 3.5, "low": 3.0, "high": 4.0}
-    block = {
-        "latent": case(0.98, 2.5, 40.0),
-        "naive_3": case(1.0, 6.0, 55.0, intervals={"observations_per_poi": more, "time_s": slower}),
-        "random": case(0.5, 1.0, 20.0),
-        "camera_alone": case(0.5, 1.0, 20.0),
-        "bytes_per_detection": {"latent": 16, "raw": 2000},
-    }
-    by_looks, by_time = result_plots.policies(block).axes
-    names = [label.get_text() for label in by_looks.get_yticklabels()]
-    assert names == ["naive_3", "latent", "random"]  # upwards
-    wrong = [text.get_text().split(" %")[0] for text in by_time.texts]
-    assert wrong == ["0.0", "2.0", "50.0"]
-    assert by_looks.lines[0].get_xdata() == [6.0]
-    # A bar for the difference of naive exploration from the latent policy, around its own value.
-    (bar,) = by_time.collections
-    ((low, high),) = bar.get_segments()
-    assert (low.tolist(), high.tolist()) == ([52.0, 0.0], [58.0, 0.0])
-
-
 def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
     # Of ten looks at a class, nine say so with .9, and one says the opposite. A bin of fewer than
     # twenty looks, six with .8, is left out.

@@ -230,12 +230,6 @@ FUNCTIONS = {
         lambda w: vae.Jmvae(("a", "b", "a+b"), (2, 2, 2), 2, (8,)),
         "modalities = ('a', 'b', 'a+b'): must have no +, which joins names",
     ),
-    "train diverges": (
-        lambda w: vae.train(
-            w.key, jax.tree.map(lambda x: NAN * x, w.params), w.model, w.bank, SMOKE.jmvae
-        ),
-        "losses = nan: must be finite; scale features to a deviation of 1, or lower learning_rate",
-    ),
     "loss batch": (
         lambda w: loss(w, (w.x[None], w.x[None])),
         "features of camera has the shape (1, 2): must be (2,); use jax.vmap for a batch",

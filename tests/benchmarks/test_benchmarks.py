@@ -125,15 +125,6 @@ def test_all_rows_as_a_user_measures_them(tmp_path):
     check_printed(rows, done.stdout, done.stderr)
 
 
-def test_an_existing_file_is_not_overwritten(tmp_path, capsys):
-    path = tmp_path / "rows.json"
-    path.write_text("precious")
-    with pytest.raises(SystemExit):
-        __main__.main(["--quick", "--json", str(path)])
-    assert path.read_text() == "precious"
-    assert "already exists" in capsys.readouterr().err
-
-
 def test_a_ratio_is_how_many_times_faster_we_are():
     rate, seconds = (Row("a", unit, 10.0, 1.0, 1, theirs=5.0) for unit in ("steps/s", "s"))
     assert (rate.ratio, seconds.ratio) == (2.0, 0.5)

@@ -69,10 +69,3 @@ def test_every_task_is_registered(env):
     assert (made.played.agent, made.name) == ("lidar", "map-v0")
     assert params.max_steps_in_episode == jaxsense.make("map-v0").max_steps
     assert (env.name, env.num_actions) == ("jaxsense-Map", NOP + 1)
-
-
-@pytest.mark.parametrize("action", [1.7, np.array([0, 1])])
-def test_an_action_that_is_no_integer_is_refused(env, params, action):
-    _, state = env.reset(jax.random.key(0), params)
-    with pytest.raises(ValueError, match="action"):
-        env.step(jax.random.key(1), state, action, params)

@@ -52,15 +52,6 @@ def test_the_goal_is_the_nearest_viewpoint(robot):
     assert robot.target == 0
 
 
-def test_the_goal_is_not_where_another_robot_is(ros2, robot, stub):
-    other = ros2.Robot(CONTENTS, stub.programs(), 0, POSITIONS)
-    arrive(other, (1.1, 0.1, 0.0))
-    robot.hear(0.0, other.report())
-    goal = arrive(robot)
-    assert np.linalg.norm(goal[:2] - [1.1, 0.1]) >= 0.3
-    assert np.linalg.norm(goal[:2] - POSITIONS[0]) == pytest.approx(0.9)
-
-
 @pytest.mark.parametrize("mounting", [(0, 0, 0), (0.2, 0.1, 0), (0.1, -0.2, math.pi / 2)])
 def test_bearing_and_distance_are_those_of_the_sensor(ros2, robot, stub, mounting):
     robot.mounting = np.array(mounting, float)
