@@ -154,11 +154,11 @@ def require_belief(name: str, belief: Belief, size: int | None = None) -> None:
     require_positive(f"{name}.std", belief.std)
 
 
-def require_members(name: str, value: object, protocol: type, needed: Sequence[str] = ()) -> None:
-    """A value has the members of a protocol that are named, or all."""
+def require_members(name: str, value: object, protocol: type) -> None:
+    """A value has the members of a protocol."""
     if isinstance(value, type):
         raise ValueError(f"{name} = {value.__name__}: must be a {protocol.__name__}, not its class")
-    members = needed or [member for member in vars(protocol) if not member.startswith("_")]
+    members = [member for member in vars(protocol) if not member.startswith("_")]
     missing = [member for member in members if not hasattr(value, member)]
     if missing:
         kind, expected = type(value).__name__, f"must be a {protocol.__name__}"

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import ClassVar
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -167,7 +168,7 @@ class MapEnvironment:
 @checks.typed
 def observation(belief: Belief) -> Float[Array, " S"]:
     """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI."""
-    checks.require_shape("belief.mean", belief.mean, (None, None))
-    checks.require_shape("belief.std", belief.std, belief.mean.shape)
+    chex.assert_rank(belief.mean, 2)
+    chex.assert_equal_shape([belief.mean, belief.std])
     checks.require_positive("belief.std", belief.std)
     return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from typing import Protocol
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -192,7 +193,7 @@ def reset_with_looks(
         random_classes, random_seen = random_start(start_key, mdp)
         classes = random_classes if classes is None else classes
         seen = random_seen if seen is None else seen
-    checks.require_shape("classes", classes, (mdp.num_pois,))
+    chex.assert_shape(classes, (mdp.num_pois,))
     checks.require_index("classes", classes, mdp.num_classes)
     scene = mdp.looks.scene(scene_key, classes)
     pois = jnp.arange(mdp.num_pois)
@@ -217,7 +218,7 @@ def begin(
       looks: for each modality `[N, D_m]` features of a look at each PoI; ignored where `seen` is
         False.
     """
-    checks.require_shape("seen", seen, (mdp.num_pois, mdp.num_modalities))
+    chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities))
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
@@ -225,6 +226,7 @@ def begin(
     return MapState(beliefs, seen, classes, scene, jnp.int32(0))
 
 
+@checks.typed
 def step(
     key: Key, mdp: MapMdp, state: MapState, action: Int[Array, ""], modality: Index
 ) -> tuple[MapState, Outcome]:
@@ -237,10 +239,8 @@ def step(
     Raises:
       ValueError: if there is no such modality or action, or if the reward is not one number.
     """
-    checks.require_key(key)
-    checks.require_type("state", state, MapState, "as from reset")
     checks.require_index("modality", modality, mdp.num_modalities)
-    checks.require_shape("action", action, ())
+    chex.assert_rank(action, 0)
     checks.require_index("action", action, mdp.num_pois + 1)
     is_nop = action == mdp.num_pois
     poi = jnp.minimum(action, mdp.num_pois - 1)

@@ -16,6 +16,7 @@ import itertools
 import math
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,7 +61,6 @@ class LookValues:
         self, probabilities: Float[Array, " C"], is_seen: Bool[Array, ""]
     ) -> Float[Array, ""]:
         """Value of the next look and all worthwhile looks after it."""
-        checks.require_probabilities("probabilities", probabilities)
         return jnp.where(is_seen, self._read(self.q, probabilities), self.q_unseen)
 
     def _read(self, table: jax.Array, probabilities: jax.Array) -> jax.Array:
@@ -109,7 +109,7 @@ def _rows(sums, steps: int):
 def interpolate(table: Float[Array, " P"], probabilities: Float[Array, " C"]) -> Float[Array, ""]:
     """Interpolates a table of values linearly between the points of the lattice."""
     checks.require_shape("probabilities", probabilities, (None,))
-    checks.require_shape("table", table, (None,))
+    chex.assert_rank(table, 1)
     steps = steps_of_lattice(len(probabilities), len(table))
     number = _num_points(steps, len(probabilities))
     if len(table) != number:
@@ -139,6 +139,7 @@ def _corners(weights: jax.Array, steps: int) -> tuple[jax.Array, jax.Array]:
     ] - falling[1:]
 
 
+@checks.typed
 def value_iteration(
     likelihoods: Float[Array, "C K C"],
     reward: Reward,
@@ -162,11 +163,9 @@ def value_iteration(
       The values at the points of the lattice. The optimal policy takes every look whose `q` is
       above 0, that of no operation.
     """
-    checks.require_members("reward", reward, Reward, ("information", "of_gain"))
-    checks.require_type("config", config, MdpConfig, "as config.mdp")
-    checks.require_shape("likelihoods", likelihoods, (None, None, None))
+    chex.assert_rank(likelihoods, 3)
     number, num_looks, _ = likelihoods.shape
-    checks.require_shape("likelihoods", likelihoods, (number, None, number))
+    chex.assert_shape(likelihoods, (number, None, number))
     checks.require_finite("likelihoods", likelihoods)
     checks.require_number("horizon", horizon)
     points = jnp.asarray(lattice(number, max_points), likelihoods.dtype)

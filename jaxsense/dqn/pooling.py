@@ -4,12 +4,12 @@ One small network reads each PoI, its surroundings and a pool over all PoIs (Zah
 Deep Sets). PoIs that are not present are masked out.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from jaxsense.core import checks
 from jaxsense.core.networks import Dense
 
 _REACHES = (2.0, 6.0)  # s, within which PoIs count as near
@@ -40,7 +40,7 @@ class PoolingNetwork(nn.Module):
         """
         batch = x.shape[1:]
         shape = self.features, x.shape[0] // self.features, *batch
-        checks.require_shape("x", x, (shape[0] * shape[1], *batch))
+        chex.assert_shape(x, (shape[0] * shape[1], *batch))
         x = x.reshape(shape)
         present, place, known = x[-3][None], x[-2:], x[:-2]
         layers = [

@@ -4,6 +4,7 @@ Transitions are columns, drawn in blocks of neighbouring environments: copying a
 memory is many times faster than picking single numbers.
 """
 
+import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -32,9 +33,9 @@ def init(state_size: int, rounds: int, blocks: int, width: int) -> Replay:
       state_size: numbers in a state.
       rounds: capacity, T.
     """
-    for name, value in (("rounds", rounds), ("blocks", blocks), ("width", width)):
-        checks.require_number(name, value)
-    checks.require_number("state_size", state_size)
+    sizes = {"state_size": state_size, "rounds": rounds, "blocks": blocks, "width": width}
+    for name, size in sizes.items():
+        checks.require_number(name, size)
     return Replay(jnp.zeros((rounds, blocks, 2 * state_size + 3, width)), jnp.int32(0))
 
 
@@ -71,10 +72,9 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
     Returns:
       `[S, B * W]` states, and `[B * W]` other fields.
     """
-    checks.require_shape("draws", draws, (None, 2))
+    chex.assert_shape(draws, (None, 2))
     if draws.dtype.itemsize < 4:
         raise ValueError(f"draws of dtype {draws.dtype}: must be float32, to reach every round")
-    checks.require("draws", draws, lambda x: (x >= 0) & (x < 1), "must be from 0 to below 1")
     checks.require("rounds in replay", replay.count, lambda x: x > 0, "must be 1 or more; add some")
     rounds, blocks, rows, width = replay.columns.shape
     filled = jnp.minimum(replay.count, rounds)

@@ -86,7 +86,6 @@ def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
 
     Korthals et al. 2018, Sec. IV.
     """
-    checks.require_shape("std", std, (..., None))
     checks.require_positive("std", std)
     return 1.0 / jnp.linalg.norm(std, axis=-1)
 

@@ -11,6 +11,7 @@ Travel times follow a model, see `Travel`.
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -247,7 +248,6 @@ def observation(
       the nearest other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality,
       one number for each; whether the PoI is present; and its position relative to the robot.
     """
-    checks.require_positive("belief.std", belief.std)
     times = travel_times(travel, team)
     soon = jnp.exp(-times / TIME_SCALE)
     carries = team.modality[None] == jnp.arange(num_modalities)[:, None]
@@ -374,7 +374,7 @@ def step(
       chooses next, and the seconds that passed.
     """
     checks.require_key(key)
-    checks.require_shape("action", action, ())
+    chex.assert_rank(action, 0)
     checks.require_index("action", action, mdp.map.num_pois + 1)
     num_pois, team, travel = mdp.map.num_pois, state.team, mdp.travel
     robots = jnp.arange(team.poses.shape[0])

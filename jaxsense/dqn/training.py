@@ -191,8 +191,7 @@ def train_chunk(
       evaluate: `(key, parameters) -> []` total reward of the learned policy, called after every
         tenth epoch, or after the last if ten do not divide the chunk.
     """
-    for part in jax.tree.leaves(prepared):
-        checks.require_shape("prepared", part, (config.num_starts, ...))
+    chex.assert_tree_shape_prefix(prepared, (config.num_starts,))
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     *draw_keys, evaluation_key = jax.random.split(key, 4)
     draws = _draw(draw_keys, config)

@@ -1,5 +1,6 @@
 """The start of missions."""
 
+import chex
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -86,18 +87,18 @@ def start(
     config = mission.config
     num_robots, num_pois = len(config.carried), config.arena.num_pois
     num_classes = len(config.arena.classes)
-    checks.require_shape("classes", classes, (num_pois,))
+    chex.assert_shape(classes, (num_pois,))
+    chex.assert_shape(scene.poses, (num_robots, 3))
+    chex.assert_shape([faults.stops_at, faults.blind_at], (num_robots,))
     checks.require_index("classes", classes, num_classes)
     checks.require_index("policy", policy, len(mission.policies))
-    checks.require_shape("scene.poses", scene.poses, (num_robots, 3))
     for name, times in vars(faults).items():
-        checks.require_shape(f"faults.{name}", times, (num_robots,))
         expected = "must be seconds, infinite for never"
         checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
     paths = roadmap.build(config, scene.layout) if paths is None else paths
     own_maps = config.mission.communication.own_maps
     pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
-    checks.require_shape("pose_error", pose_error, (num_robots, 3))
+    chex.assert_shape(pose_error, (num_robots, 3))
     return MissionState(
         scene=scene,
         pose_error=pose_error,
