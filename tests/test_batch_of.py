@@ -52,11 +52,12 @@ def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
     assert ledger.batch_of(large, 10_000) == 25
 
 
+@pytest.mark.slow  # traces the start of large missions
 @pytest.mark.parametrize(
     "config",
     [
         pytest.param(crowded(CONFIG, num_pois=8), id="maps"),
-        pytest.param(LARGEST, id="largest", marks=pytest.mark.slow),
+        pytest.param(LARGEST, id="largest"),
     ],
 )
 def test_what_is_counted_is_what_a_mission_takes(config):

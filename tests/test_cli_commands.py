@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from recordings import CONFIG, FUSION, recording
 from smoke import error_line
+from untrained import untrained
 
 import jaxsense
 from jaxsense import __main__ as commands
@@ -117,7 +118,7 @@ class Player:
 
 @pytest.fixture(scope="module")
 def models():
-    return jaxsense.init(jax.random.key(0), CONFIG)
+    return untrained(CONFIG)
 
 
 @pytest.fixture

@@ -6,8 +6,7 @@ import re
 import pytest
 import rich.console
 
-from jaxsense.show.tables import Table
-from jaxsense.show.terminal import Display, as_text
+from jaxsense.show.terminal import Display
 
 
 def show(display):
@@ -36,11 +35,3 @@ def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys, is_quiet)
     told = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in lines]
     assert told == ([] if is_quiet else expected)
     assert records[1] == {"stage": "dqn_camera", "step": 200, "loss": 0.25, "reward": 1.0}
-
-
-def test_a_table_is_not_cut_without_a_terminal():
-    table = Table("caption", [f"column {n} " + "x" * 20 for n in range(9)], [("row", ["1"] * 9)])
-    text = as_text(rich.console.Console(file=io.StringIO(), width=80), table)
-    assert all(name in text for name in table.columns)
-    narrow = rich.console.Console(file=io.StringIO(), width=80, force_terminal=True)
-    assert not any(name in as_text(narrow, table) for name in table.columns)

@@ -141,16 +141,6 @@ def test_labels_follow_the_declaration():
     assert arena.values("temperature") == (60.0, 5.0, 5.0)
 
 
-def test_the_narrowest_side_of_all_shapes_in_use_counts():
-    shapes = {
-        "slab": Shape("box", (1.0, 0.6)),
-        "post": Shape("cylinder", (0.8, 0.8)),
-        "stick": Shape("box", (0.5, 0.5)),  # of no class
-    }
-    arena = ArenaConfig(shapes=shapes, classes=("red slab", "red post"), poi_radius=0.2)
-    assert arena.poi_half_width == pytest.approx(0.6 * 0.2)
-
-
 @pytest.mark.parametrize(
     ("function", "expected"),
     [

@@ -10,7 +10,7 @@ import jax
 import pytest
 from matplotlib.figure import Figure
 from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
-from summaries import CASE, EVALUATION, SUMMARY
+from summaries import CASE, SUMMARY
 
 import jaxsense
 from jaxsense import mission, summary
@@ -138,14 +138,6 @@ def test_a_film_is_drawn_whole_and_can_be_paused_without_a_script(run):
     frames = [re.findall("@keyframes.*", each.findtext(".//{*}style")) for each in (here, there)]
     assert frames[0] == frames[1]
     assert len(frames[0]) > 10
-
-
-def test_evaluations_have_tables_of_their_own(tmp_path):
-    text = page.render(tmp_path, CONFIG, SUMMARY, {"there": EVALUATION})
-    assert "Evaluation: 16 PoIs in 6 m; robots: 2 camera, 1 lidar; seed 7" in words(text)
-    rows = re.findall(r'<th scope="row">latent</th>\s*<td>(?:<b>)?([\d.]+)', text)
-    # Of each: the main figures, all of them, and the calibration of the maps.
-    assert rows == ["0.998", "0.998", "0.998", "0.750", "0.750", "0.998"]
 
 
 def test_a_page_of_several_seeds_links_to_theirs(tmp_path):

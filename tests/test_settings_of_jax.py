@@ -16,12 +16,6 @@ KEY = jax.random.key(0)
 CONFIG = jaxsense.PRESETS["default"]
 
 
-def step(name):
-    task = jaxsense.make(name)
-    _, state = task.reset(KEY)
-    return task.step(KEY, state, jnp.int32(1))
-
-
 def play(name):
     task = jaxsense.make(name)
     task.play_reference(KEY, "naive")
@@ -54,8 +48,6 @@ def remember():
 @pytest.mark.parametrize(
     "function",
     [
-        lambda: step("map-v0"),
-        lambda: step("team-v0"),
         lambda: play("map-v0"),
         lambda: play("team-v0"),
         paths,
@@ -68,6 +60,7 @@ def test_functions_trace_with_strict_promotion(function):
         jax.eval_shape(function)
 
 
+@pytest.mark.slow
 def test_values_of_looks_have_the_dtype_of_the_likelihoods():
     dtype = jnp.float64
     expected = values()

@@ -224,7 +224,7 @@ def test_text_is_read_and_written_as_utf_8():
                 assert "encoding" in named or is_binary or is_of_zip, f"{file}:{node.lineno}"
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=25, deadline=None, derandomize=True, database=None)
 @given(st.dictionaries(st.sampled_from(["preset", "seed", "config", "x"]), ANYTHING))
 def test_any_config_file_is_read_or_refused(tmp_path_factory, content):
     file = tmp_path_factory.getbasetemp() / "any.json"

@@ -73,11 +73,6 @@ def returns(value, memory=None):
     return jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, observation: value, memory))
 
 
-def on_host(act):
-    """A score of a policy on the host."""
-    return jaxsense.score("map-v0", tasks.on_host(act))
-
-
 def of_missions(w, config=SMOKE, models=None, policies=None, **options):
     """A score of missions, of a policy unless others are given."""
     models, policies = models or w.models, policies or {"mine": values}
@@ -159,10 +154,6 @@ FUNCTIONS = {
     "mean_return key": (
         lambda w: tasks.mean_return(7, "map-v0", nop, 2),
         "key = 7: must be one key, as from jax.random.key(0)",
-    ),
-    "on_host action": (
-        lambda w: on_host(lambda seen: np.full(len(seen), 2**32 + 3)),
-        "policy = <lambda>: must return actions from 0 to 3",
     ),
     "task step team": (
         lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0),

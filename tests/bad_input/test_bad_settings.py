@@ -76,7 +76,7 @@ def test_a_value_just_outside_the_limits_is_refused(place, name):
         assert told.endswith(f": {limits.expected(value)}")
 
 
-@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.tuples(st.sampled_from(FIELDS), ANYTHING), min_size=1, max_size=3))
 def test_settings_are_refused_or_survive_json(changes):
     try:
@@ -90,7 +90,7 @@ def test_settings_are_refused_or_survive_json(changes):
         assert from_plain(json.loads(json.dumps(as_plain(config), allow_nan=False))) == config
 
 
-@settings(max_examples=100, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(
     st.dictionaries(
         st.sampled_from([*SECTIONS, "modalities", "sensors", "x"]),

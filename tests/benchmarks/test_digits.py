@@ -24,23 +24,6 @@ def data():
     return digits.split(("noise", "a", "b"), (rng.standard_normal((120, 2)), *views), labels)
 
 
-def test_initial_weights_are_drawn_as_pytorch_draws_them():
-    model = vae.Jmvae(("a", "b"), (100, 25), 16, (64,))
-    of_key = [digits.init_as_pytorch(jax.random.key(i), model) for i in range(2)]
-    assert jax.tree.map(jnp.shape, of_key[0]) == jax.tree.map(
-        jnp.shape, vae.init(jax.random.key(0), model)
-    )
-    layers = of_key[0]["encoders"]["b"]["params"]
-    for layer, inputs in (("Dense_0", 25), ("Dense_1", 64)):
-        # Of a uniform draw up to the limit, the standard deviation is limit / sqrt(3).
-        limit = 1 / math.sqrt(inputs)
-        for name in ("kernel", "bias"):
-            drawn = np.asarray(layers[layer][name])
-            assert 0.8 * limit < np.abs(drawn).max() <= limit
-            np.testing.assert_allclose(drawn.std(), limit / math.sqrt(3), rtol=0.25)
-    assert not np.allclose(*(x["encoders"]["b"]["params"]["Dense_0"]["kernel"] for x in of_key))
-
-
 def test_the_split_takes_three_quarters_of_each_label_and_scales_by_them(data):
     np.testing.assert_array_equal(np.bincount(data.train_labels), [30, 30, 30])
     np.testing.assert_array_equal(np.bincount(data.test_labels), [10, 10, 10])
