@@ -50,11 +50,11 @@ class Team:
     @property
     def heads(self) -> Bool[Array, "R N"]:
         """Which robot heads for which PoI."""
-        return self.target[:, None] == jnp.arange(len(self.positions))[None]
+        return self.target[:, None] == jnp.arange(self.positions.shape[0])[None]
 
     def others(self, robot: Int[Array, ""]) -> Bool[Array, " R"]:
         """Other robots that work."""
-        return self.works & (jnp.arange(len(self.poses)) != robot)
+        return self.works & (jnp.arange(self.poses.shape[0]) != robot)
 
     def is_taken(self, robot: Int[Array, ""]) -> Bool[Array, " N"]:
         """PoIs that other robots head for."""

@@ -44,7 +44,7 @@ class Opinion:
 def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
     """Asks a policy."""
     of_robot = lambda robot: policy.gains(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
-    none, robots = jnp.zeros(known.times.shape), jnp.arange(len(known.times))
+    none, robots = jnp.zeros(known.times.shape), jnp.arange(known.times.shape[0])
     return Opinion(
         values=policy.values(key, models, known),
         gains=jax.vmap(of_robot)(robots) if policy.is_unordered else none,
@@ -89,4 +89,4 @@ def _by_values(known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
     # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
     rank = distance + _KEPT * team.heads[robot] + _HEADED_FOR * team.is_taken(robot)
     poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, len(distance))
+    return jnp.where(jnp.any(is_best), poi, distance.shape[0])

@@ -264,7 +264,13 @@ def _process() -> Origin:
 
 
 def newest(path: Path) -> Path:
-    """A path; for `latest`, that of the newest finished run in `runs/`."""
+    """A path; for `latest`, that of the newest finished run in `runs/`.
+
+    Raises:
+      ConfigError: if there is none, or if trained models are named, which are no run.
+    """
+    if str(path).startswith(PREFIX) and not path.exists():
+        raise ConfigError("run", str(path), "only names models; must be a finished run")
     if str(path) != "latest" or path.exists():
         return path
     runs = sorted(config.parent for config in Path("runs").glob("*/config.json"))

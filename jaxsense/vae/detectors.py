@@ -163,7 +163,7 @@ class Classifier:
       params: of its network.
       offset: `[F]` mean of the windows for training.
       scale: `[]` overall standard deviation of these windows.
-      threshold: see `Detector`; minus infinity before the training.
+      threshold: see `Detector`; the lowest number before the training.
       measures_distance: whether the readings are distances in metres; the network then also reads
         how far they are from the expected distance.
       hidden: sizes of the hidden layers.
@@ -216,7 +216,7 @@ def init(
     offset, scale = networks.statistics(windows)
     numbers = (1 + measures_distance) * len(offset) + 2
     params = networks.init(key, MLP(config.hidden, num_labels + 1), numbers)
-    threshold = jnp.float32(-jnp.inf)
+    threshold = jnp.finfo(jnp.float32).min
     return Classifier(
         params, offset, scale, threshold, measures_distance, config.hidden, num_labels
     )

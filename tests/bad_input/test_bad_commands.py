@@ -135,12 +135,8 @@ OTHERS = [
         [],
         "missing argument RUN: the directory of a finished run, e.g. runs/20261123-190025-default",
     ),
-    (
-        evaluate,
-        ["pretrained:noisy"],
-        "run = 'pretrained:noisy': must be the directory of a finished run; pretrained:noisy only "
-        "names models, which python -m jaxsense.demo --preset noisy plays",
-    ),
+    (evaluate, ["pretrained:noisy"], "run = 'pretrained:noisy': only names models; must be a"),
+    (export, ["noisy"], "noisy is not a run directory: it has no config.json"),
     (evaluate, ["RUN"], "is not finished: it has no summary.json; continue it with python -m "),
     (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
     (evaluate, ["RUN", "--policy", "sonar_alone"], "policy = 'sonar_alone': must be one of"),

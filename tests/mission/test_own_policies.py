@@ -123,7 +123,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
 
 
 def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
-    played = lambda mission, compiler, batch, workers, runs_long: mission  # noqa: E731
+    played = lambda mission, compiler, total, workers: mission  # noqa: E731
     monkeypatch.setattr(programs.missions, "Player", played)
     monkeypatch.setattr(programs.stages, "train", lambda drive, config, arena: None)
     with pipeline.compiled(playing("mine"), Monitor(), policies=OWN) as made:
@@ -139,7 +139,7 @@ def test_evaluate_plays_own_policies_and_keeps_no_programs(tmp_path, monkeypatch
     found = []
 
     class Player:
-        def __init__(self, team, compiler, batch, workers, runs_long):
+        def __init__(self, team, compiler, total, workers):
             found.append(([*team.policies], compiler.kept))
 
         def wait(self):

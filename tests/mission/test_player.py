@@ -77,7 +77,7 @@ def play(team, models, begun, players, monkeypatch):
         monkeypatch.setattr(missions, "measure", measure)
         monkeypatch.setattr(missions, "batch_of", lambda *_: batch)
         with Compiler(Monitor()) as compiler:
-            player = missions.Player(team, compiler, batch, WORKERS[split]())
+            player = missions.Player(team, compiler, batch, WORKERS[split](), models)
             waited = []
             wait = missions.Program.wait
             with monkeypatch.context() as patch:
