@@ -120,6 +120,8 @@ def test_one_parameter_that_is_not_finite_is_told_at_once(chunk):
 
 def test_one_reward_that_is_not_a_number_is_told_before_it_is_learnt_from(chunk):
     run, state, prepared = chunk
-    _, info = run(with_memories(state), replace(prepared, scene=jnp.full_like(prepared.scene, jnp.nan)))
+    _, info = run(
+        with_memories(state), replace(prepared, scene=jnp.full_like(prepared.scene, jnp.nan))
+    )
     assert np.isfinite(info.loss).all()
     np.testing.assert_array_equal(info.is_finite, [False, False])
