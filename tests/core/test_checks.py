@@ -11,7 +11,6 @@ import pytest
 import jaxsense
 from jaxsense import dqn, interfaces, mission, sim, vae
 from jaxsense.core import checks
-from jaxsense.core.types import Fusion
 
 
 @pytest.mark.parametrize(
@@ -70,15 +69,3 @@ def test_every_function_refuses_a_seed_as_its_key(function, arguments, by_name):
     # Before it looks at anything else.
     with pytest.raises(ValueError, match=re.escape("key = 7: must be one key")):
         function(7, *arguments, **by_name)
-
-
-def test_what_lacks_members_of_a_protocol():
-    class Half:
-        accumulates = True
-
-        def update(self):
-            """Updates nothing."""
-
-    expected = "fusion = Half: must be a Fusion; it lacks classes, prior, together, class_prob"
-    with pytest.raises(ValueError, match=re.escape(expected)):
-        checks.require_members("fusion", Half(), Fusion)

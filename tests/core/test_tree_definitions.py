@@ -99,10 +99,3 @@ def test_a_traced_setting_does_not_switch_off_the_checks_of_others():
     assert float(jax.jit(change)(0.4)) == pytest.approx(0.4)
     with pytest.raises(ValueError, match="robots"):
         jax.jit(lambda x: change(x, robots=("camera", "nose")))(0.4)
-
-    def bearing(distance):
-        viewpoint = dataclasses.replace(config.viewpoint, min_distance=distance)
-        return dataclasses.replace(viewpoint, bearing_error=31.0).bearing_error
-
-    with pytest.raises(ValueError, match=r"viewpoint.bearing_error = 31.0: must be from 0 to 10"):
-        jax.jit(bearing)(0.4)

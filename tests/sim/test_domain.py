@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxsense
 from jaxsense.config import PRESETS, LocalisationConfig
 from jaxsense.sim import sensors
 from jaxsense.sim.domain import make_domain
@@ -15,7 +13,6 @@ from jaxsense.sim.domain import make_domain
 CONFIG = PRESETS["smoke"]
 CAMERA, LIDAR = sensors.make(CONFIG)
 DOMAINS = [make_domain(CONFIG, sensor) for sensor in (CAMERA, LIDAR)]
-MODELS = jaxsense.init(jax.random.key(0), CONFIG)
 TURN = 2 * np.pi
 
 
@@ -78,32 +75,12 @@ def test_a_look_is_known_within_all_limits(m, sensor, bearing, distance, expecte
     assert bool(DOMAINS[m].contains(*given)) is expected
 
 
-SCANS = {"camera": np.full((640, 3), 0.5, np.float32), "lidar": np.full(683, 1.0, np.float32)}
-
-
-def changed_scan(sensor, reading):
-    scan = SCANS[sensor.name].copy()
-    scan[len(scan) // 2 : len(scan) // 2 + 4] = reading  # the camera reads every fourth pixel
-    return scan
-
-
 @pytest.mark.parametrize(
-    ("m", "reading", "is_known"),
+    ("sensor", "readings", "is_valid"),
     [
-        (0, 0.5, True),
-        (0, 1.5, False),
-        (0, -0.1, False),
-        (0, np.nan, False),
-        (1, np.inf, True),
-        (1, -1.0, False),
-        (1, np.nan, False),
+        (CAMERA, [0.0, 0.5, 1.0, 1.01, -0.1, np.nan], [1, 1, 1, 0, 0, 0]),
+        (LIDAR, [0.0, 90.0, np.inf, -1.0, -np.inf, np.nan], [1, 1, 1, 0, 0, 0]),
     ],
 )
-def test_a_window_with_a_reading_that_is_none_is_not_known(m, reading, is_known):
-    # An untrained detector passes all that it can judge.
-    sensor = (CAMERA, LIDAR)[m]
-    scan = changed_scan(sensor, reading)
-    found = MODELS.detect(m, sensor, scan, jnp.float32(0.0), jnp.float32(1.0))
-    assert (bool(found.is_known), bool(found.is_there)) == (is_known, is_known)
-    if not is_known:
-        np.testing.assert_array_equal(found.features, 0.5)
+def test_readings_that_are_none_are_told(sensor, readings, is_valid):
+    np.testing.assert_array_equal(sensor.is_valid(jnp.array(readings)), is_valid)

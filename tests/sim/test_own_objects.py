@@ -34,12 +34,6 @@ def view():
     return arena, jax.jit(sim.place, static_argnums=0)(arena, LAYOUT, poses)
 
 
-def test_a_layout_holds_what_the_words_of_the_classes_stand_for():
-    np.testing.assert_allclose(LAYOUT.colour[0], [0.9, 0.4, 0.05])
-    np.testing.assert_array_equal(LAYOUT.shape, [0, 1, 0])
-    np.testing.assert_array_equal(LAYOUT.values["temperature"], [60.0, 5.0, 60.0])
-
-
 def test_rays_meet_shapes_where_their_sides_are(view):
     arena, data = view
     section = cross_section(arena, data, 0.152, robot=-1)

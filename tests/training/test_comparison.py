@@ -11,10 +11,8 @@ from by_hand import CONFIG, EXACT, KEY, detections, in_place
 from jaxsense.config import EvaluationConfig
 from jaxsense.dqn import optimum, policies
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.models import make_jmvae, make_prior
 from jaxsense.training import comparison
 from jaxsense.training.comparison import held_out_mdp, models_of
-from jaxsense.vae import filter
 
 
 def with_bias(bias):
@@ -55,18 +53,6 @@ def test_values_that_are_not_numbers_give_totals_that_are_none():
     found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
     assert all(np.isnan(x).all() for x in found.pop("latent"))
     assert all(np.isfinite(x).all() for pair in found.values() for x in pair)
-
-
-@pytest.mark.slow
-def test_where_looks_add_up_the_optimum_is_by_the_total_of_the_own_sensors_looks():
-    model, prior, classes = make_jmvae(CONFIG), make_prior(CONFIG), in_place().classes
-    fusion = filter.init(KEY, model, classes, prior, (1,))
-    # No look of the camera pays by its total, and every look of the LiDAR does.
-    models = models_with(jnp.zeros(4), (constant(1.0, -1.0), constant(-1.0, 1.0)), fusion)
-    total, _ = play(jnp.int32(0), models, EXACT)["optimal"]
-    np.testing.assert_array_equal(total, 0.0)
-    _, first = play(jnp.int32(1), models, EXACT)["optimal"]
-    assert np.all(first != 0)
 
 
 @pytest.fixture(scope="module")

@@ -20,14 +20,6 @@ def test_likelihoods_of_classes_by_hand():
     np.testing.assert_allclose(np.exp(found), [1.5, 1.5, 3e-12], rtol=1e-5)
 
 
-def test_bayes_by_hand():
-    # Two of three classes are red: .8 for red counts .8 / (2/3), and .2 for green .2 / (1/3).
-    log_weights = bayes.bayes_update(jnp.log(jnp.full(3, 1 / 3)), jnp.array([0.8, 0.2]), LABELS[0])
-    np.testing.assert_allclose(np.exp(log_weights), [0.2, 0.4, 0.4], atol=1e-6)
-    log_weights = bayes.bayes_update(log_weights, jnp.array([0.0, 1.0]), LABELS[1])
-    np.testing.assert_allclose(np.exp(log_weights), [0.0, 0.0, 1.0], atol=1e-6)
-
-
 def test_product_of_experts_by_hand():
     of = lambda mean, std: Belief(jnp.array([mean]), jnp.array([std]))  # noqa: E731
     prior = of(0.0, 1.0)

@@ -5,10 +5,9 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.vae import jmvae, readout
+from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
@@ -44,15 +43,6 @@ def with_output(params, part, name, output):
         "bias": np.array(output, np.float32),
     }
     return {**params, part: {**params[part], name: network}}
-
-
-def test_subsets_up_to_a_size_and_the_full_set_have_encoders():
-    def subsets(number):
-        return Jmvae(THREE.modalities, (2, 3, 1), 4, (8,), max_subset=number).subsets
-
-    assert subsets(1) == ((0,), (1,), (2,), (0, 1, 2))
-    assert subsets(2) == subsets(3) == subsets(9) == THREE.subsets
-    assert Jmvae(("camera",), (2,), 4, (8,), max_subset=1).subsets == ((0,),)
 
 
 def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
@@ -106,71 +96,3 @@ def test_beta_falls_by_equal_factors_to_its_last_value():
     betas = [float(jmvae.annealed_beta(jnp.int32(s), config)) for s in (0, 25, 50, 99)]
     # Half way through the 50 steps of annealing, sqrt(1 x .01) = .1.
     np.testing.assert_allclose(betas, [1.0, 0.1, 0.01, 0.01], rtol=1e-5)
-
-
-# A trained one, on features as the detectors give them.
-
-CONFIG = JmvaeConfig(
-    hidden=(64, 64),
-    alpha=0.1,
-    beta=0.003,
-    initial_beta=0.5,
-    annealing=0.5,
-    reconstruction_weights=(10.0, 10.0),
-    steps=1500,
-    batch=128,
-    learning_rate=2e-3,
-)
-MODEL = Jmvae(("camera", "lidar"), (2, 2), CONFIG.latent_size, CONFIG.hidden)
-LABELS = ((1, 0, 0), (0, 0, 1))  # green cylinder, red cylinder, red cube: colour and shape
-
-
-@functools.partial(jax.jit, static_argnums=1)
-def two_hot_bank(key, per_class):
-    """`[C, S, 2]` probabilities per modality: .9 or more for the right label."""
-
-    def features(key, labels):
-        doubt = 0.1 * jax.random.uniform(key, (len(labels), per_class))
-        is_second = jnp.array(labels)[:, None] == 1
-        second = jnp.where(is_second, 1 - doubt, doubt)
-        return jnp.stack([1 - second, second], axis=-1)
-
-    keys = jax.random.split(key, len(LABELS))
-    return tuple(features(k, labels) for k, labels in zip(keys, LABELS, strict=True))
-
-
-@pytest.fixture(scope="module")
-def trained():
-    """Losses, and beliefs of new detections: joint and one per modality, `[C, S, D]`."""
-    untrained, bank = init(jax.random.key(0), MODEL), two_hot_bank(jax.random.key(1), 500)
-    train = jax.jit(jmvae.train, static_argnames=("model", "config"))
-    params, losses = train(jax.random.key(2), untrained, model=MODEL, bank=bank, config=CONFIG)
-    bank = two_hot_bank(jax.random.key(3), 50)
-
-    @jax.jit
-    def examine(camera, lidar):
-        both = jax.vmap(jax.vmap(lambda x, w: jmvae.posterior(params, MODEL, (x, w))))
-        return {
-            "joint": both(camera, lidar),
-            "camera": jax.vmap(jax.vmap(lambda x: jmvae.posterior(params, MODEL, (x, None))))(
-                camera
-            ),
-            "lidar": jax.vmap(jax.vmap(lambda w: jmvae.posterior(params, MODEL, (None, w))))(lidar),
-        }
-
-    return params, losses, bank, examine(*bank)
-
-
-@pytest.mark.slow
-def test_trained_posteriors_reproduce_table_1(trained):
-    beliefs = trained[3]
-    class_means = beliefs["joint"].mean.mean(axis=1)
-    plausible = jax.jit(jax.vmap(jax.vmap(readout.plausible_classes, (0, None)), (0, None)))
-    only_true = np.eye(3, dtype=bool)[:, None]
-    shares = {
-        name: np.all(plausible(b, class_means) == only_true, axis=-1).mean(axis=1)
-        for name, b in beliefs.items()
-    }
-    np.testing.assert_array_equal(shares["joint"] > 0.9, [True, True, True])
-    np.testing.assert_array_equal(shares["camera"] > 0.9, [True, False, False])
-    np.testing.assert_array_equal(shares["lidar"] > 0.9, [False, False, True])

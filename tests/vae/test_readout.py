@@ -31,13 +31,6 @@ def test_a_mixture_has_the_moments_by_hand():
     np.testing.assert_allclose(found.std, [np.sqrt(0.16 + 1.0), 0.4], atol=1e-6)
 
 
-def test_a_single_dimension_holds_three_classes():
-    line = Belief(jnp.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), jnp.full((3, 2), 0.3))
-    shares = jnp.array([0.2, 0.3, 0.5])
-    found = jax.jit(readout.make(line).class_probabilities)(mixture(line, shares), PRIOR)
-    np.testing.assert_allclose(found, shares, atol=1e-4)
-
-
 @pytest.mark.parametrize("variance", [20.0, 1.0, 0.01])
 def test_a_prior_may_be_of_any_class_however_wide_it_is(variance):
     # Of the classes in the first dimension, 1.2^2 + .4^2 = 1.6 is the largest mean square.
@@ -97,7 +90,6 @@ def looked_at(labels, prototypes, looks):
 SQUARE = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
 GRID = [(a, b) for a in range(4) for b in range(4)]
 WORLDS = {
-    "2x2": ([[0, 0, 1, 1], [0, 1, 0, 1]], [[-1, -1.1], [-1, 1], [1, -1.1], [1, 1]]),
     "5 of 3x2": (
         [[0, 0, 1, 1, 2], [0, 1, 0, 1, 0]],
         [[m, n] for m in (-1.1, 0.0, 1.1) for n in (-0.8, 0.8)][:5],
@@ -106,7 +98,6 @@ WORLDS = {
         [[a for a, _ in GRID], [b for _, b in GRID]],
         [[*SQUARE[a], *SQUARE[b]] for a, b in GRID],
     ),
-    "one sensor": ([[0, 1, 2]], [[-1.0, 0.0], [1.0, 0.2], [0.1, 1.0]]),
 }
 
 
