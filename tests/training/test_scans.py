@@ -45,20 +45,30 @@ def begun(stage: Stage, config: Config, outputs) -> Any:
 
 @pytest.fixture(scope="module")
 def learned():
-    """All stages up to `grouped`, with a single JMVAE."""
+    """All stages up to `shown`, of what was drawn, not seen, with a single JMVAE."""
+
+    def surveys(keys, world, classes, is_empty, places):
+        shape, windows = classes.shape, [sensor.window for sensor in world.sensors]
+        camera, lidar = (
+            jax.random.uniform(keys[m], (*shape, n * (1, 3)[m == 0])) for m, n in enumerate(windows)
+        )
+        return (), (camera, lidar), jnp.ones((shape[0], 2, shape[1]))
+
     once = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=1))
-    return learn_by_stages(KEY, once, until="grouped")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(looks, "surveys", surveys)
+        return learn_by_stages(KEY, once, until="shown")
 
 
 def test_scenes_come_in_groups_that_show_the_same_pois():
     draw = jax.jit(draw_scenes)
     keys, classes, is_empty, places = draw(KEY, TINY)
     number = sum(num_scenes(TINY)[:3])
-    assert number % 3 == 0
-    grouped = classes[:number].reshape(-1, 3, classes.shape[1])
-    np.testing.assert_array_equal(grouped, jnp.repeat(grouped[:, :1], 3, axis=1))
+    assert number % 4 == 0
+    grouped = classes[:number].reshape(-1, 4, classes.shape[1])
+    np.testing.assert_array_equal(grouped, jnp.repeat(grouped[:, :1], 4, axis=1))
     assert not is_empty[:number].any()
-    of_groups = np.asarray(jax.random.key_data(places))[:number].reshape(-1, 3, 2)
+    of_groups = np.asarray(jax.random.key_data(places))[:number].reshape(-1, 4, 2)
     assert (of_groups == of_groups[:, :1]).all()
     assert len({tuple(x) for x in of_groups[:, 0]}) == len(of_groups)
     of_scenes = {tuple(x) for x in np.asarray(jax.random.key_data(keys))}
@@ -69,11 +79,11 @@ def test_scenes_come_in_groups_that_show_the_same_pois():
 
 
 def test_groups_hold_all_looks_at_one_poi():
-    # 6 scenes, 2 groups of 3 looks; 4 PoIs, windows of 2 numbers.
-    windows = jnp.arange(6 * 4 * 2.0).reshape(6, 4, 2)
+    # 8 scenes, 2 groups of 4 looks; 3 PoIs, windows of 2 numbers.
+    windows = jnp.arange(8 * 3 * 2.0).reshape(8, 3, 2)
     found = scans.grouped(windows, TINY)
-    assert found.shape == (8, 3, 2)
-    np.testing.assert_array_equal(found[5], windows[3:6, 1])
+    assert found.shape == (6, 4, 2)
+    np.testing.assert_array_equal(found[4], windows[4:, 1])
 
 
 def test_no_label_enters_the_training(learned):
@@ -107,7 +117,8 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
         for w in windows
     ))  # fmt: skip
     stage, taken_for = listed["detections"], Shown(outputs["shown"].calibrating, bank=shown)
-    found = begun(stage, TINY, {**outputs, "shown": taken_for})
+    untrained = {"detector_camera": (), "detector_lidar": ()}
+    found = begun(stage, TINY, {**outputs, **untrained, "shown": taken_for})
     for bank in found.bank:
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
 
@@ -126,8 +137,8 @@ def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     )
 
     def plain(survey, scene, poi):
-        """From the three looks by each sensor at a PoI, of which `scene` is the first."""
-        windows = [np.asarray(x)[scene : scene + 3, poi] for x in survey.windows]
+        """From the four looks by each sensor at a PoI, of which `scene` is the first."""
+        windows = [np.asarray(x)[scene : scene + 4, poi] for x in survey.windows]
         mean = posterior(in_frames(windows)).mean
         return np.argmin(np.sum((classes - np.asarray(mean)) ** 2, axis=1))
 
@@ -135,18 +146,18 @@ def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     calibrating = jax.tree.map(lambda x: x[-12:], surveys.training)
     assert shown.bank.shape == (num_bank, 3)
     assert shown.calibrating.shape == (12, 3)
-    for scene, poi in ((0, 0), (3, 2), (9, 1)):
+    for scene, poi in ((0, 0), (4, 2), (8, 1)):
         for found, survey in ((shown.bank, surveys.others), (shown.calibrating, calibrating)):
             expected = plain(survey, scene, poi)
-            np.testing.assert_array_equal(found[scene : scene + 3, poi], expected)
+            np.testing.assert_array_equal(found[scene : scene + 4, poi], expected)
 
 
 def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, monkeypatch):
-    """A quarter of 14 groups of scenes, rounded up: 4 groups of 3."""
+    """A quarter of 10 groups of scenes, rounded up: 3 groups of 4."""
     outputs, stage = learned.outputs, stages_of(TINY)["detector_camera"]
     windows = np.asarray(outputs["survey"].training.windows[0])
     num_train, _, size = windows.shape
-    assert num_train == num_scenes(TINY)[0] == 42
+    assert num_train == num_scenes(TINY)[0] == 40
     given = []
 
     def calibrate(encoder, *given_here):
@@ -158,11 +169,11 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     inputs = inputs_of(stage.name, TINY, outputs)
     state = stage.begin(KEY, TINY, **inputs)
     (encoder, problem), _ = stage.advance(KEY, TINY, state, **inputs)
-    np.testing.assert_array_equal(given[0], windows[30:].reshape(-1, size))
+    np.testing.assert_array_equal(given[0], windows[28:].reshape(-1, size))
     np.testing.assert_array_equal(given[1], outputs["shown"].calibrating.reshape(-1))
-    np.testing.assert_array_equal(problem.shown.windows, windows[:30].reshape(-1, size))
-    np.testing.assert_allclose(encoder.presence.offset, windows[:30].mean(axis=(0, 1)), rtol=1e-5)
-    assert all(len(x) == 10 * TINY.arena.num_pois for x in outputs["views"].groups)
+    np.testing.assert_array_equal(problem.shown.windows, windows[:28].reshape(-1, size))
+    np.testing.assert_allclose(encoder.presence.offset, windows[:28].mean(axis=(0, 1)), rtol=1e-5)
+    assert all(len(x) == 7 * TINY.arena.num_pois for x in outputs["views"].groups)
 
 
 REPEATING = dataclasses.replace(TINY, detector=dataclasses.replace(TINY.detector, num_repeats=30))
@@ -176,9 +187,9 @@ def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(lea
     found = scans.repeated(KEY, REPEATING, scenes=scenes, shown=Shown(bank[:0], bank))
     assert found.classes.shape == (30, 3)
     np.testing.assert_array_equal(found.taken_for, (found.classes[:, 0] + 1) % 3)
-    groups = num_bank // 3
+    groups = num_bank // 4
     assert groups < 30
-    # The i-th scene shows the PoIs of the i-th group of three scenes, then the first again.
+    # The i-th scene shows the PoIs of the i-th group of four scenes, then the first again.
     of_scenes = jax.random.key_data(places)[num_train : num_train + num_bank]
-    expected = np.asarray(of_scenes)[np.arange(30) % groups * 3]
+    expected = np.asarray(of_scenes)[np.arange(30) % groups * 4]
     np.testing.assert_array_equal(jax.random.key_data(found.places), expected)

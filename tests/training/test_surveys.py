@@ -112,7 +112,7 @@ def test_numbers_of_scenes(num_pois, num_scans, observe, together, expected):
         MEASURED,
         arena=dataclasses.replace(MEASURED.arena, num_pois=num_pois),
         detector=dataclasses.replace(MEASURED.detector, num_scans=num_scans),
-        jmvae=JmvaeConfig(samples_per_class=10, looks=4, **learning),
+        jmvae=JmvaeConfig(samples_per_class=10, **learning),
         dqn=dataclasses.replace(MEASURED.dqn, observe=observe),
     )
     assert num_scenes(config) == expected
