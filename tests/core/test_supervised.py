@@ -78,17 +78,9 @@ def test_the_last_chunk_makes_no_step_too_many():
         states.append(fit(states[-1], problem)[0])
     assert [int(state.step) for state in states] == [0, 2, 4, 5]
     one, losses = fit(states[2], Given(problem.loss, [0.0], 5))
+    assert losses[0] == states[2].params + 4  # steps are counted from the start
     assert one.params == states[3].params != states[2].params
     np.testing.assert_allclose(states[3].loss, losses[0], rtol=1e-6)
-
-
-def test_the_loss_receives_the_step_counted_from_the_start():
-    problem = Given(lambda params, batch, step: step.astype(jnp.float32), [0.0] * 3, 6)
-    state, counted = start(jnp.float32(0), problem), []
-    for _ in range(2):
-        state, steps = fit(state, problem)
-        counted.extend(steps.tolist())
-    assert counted == [0, 1, 2, 3, 4, 5]
 
 
 def test_the_last_step_tells_of_it_also_where_a_chunk_has_more_steps_than_are_left():

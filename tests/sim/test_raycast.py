@@ -163,12 +163,3 @@ def test_turned_as_worked_by_hand():
     x, y = raycast.turned((jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])), jnp.float32(np.pi / 2))
     np.testing.assert_allclose(x, [0.0, -1.0], atol=1e-6)
     np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-6)
-
-
-def test_a_cross_section_holds_everything_that_is_seen_once(arena):
-    section = raycast.cross_section(arena, arena.data, 0.1, 0)
-    names = [arena.mj_model.geom(g).name for g in section.geom]
-    pois = [f"poi{n}_{shape}" for shape in ("cylinder", "cube") for n in range(3)]
-    walls = [f"wall{w}" for w in range(4)]
-    assert sorted(names) == sorted([*pois, *walls, "robot1_body", "robot1_lidar"])
-    assert section.num_circles == 4

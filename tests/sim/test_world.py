@@ -157,16 +157,6 @@ def looks(simulation):
     return np.array(pois), scenes, after
 
 
-def test_look_moves_its_robot_only(looks):
-    _, before, after = looks
-    for robot, (_, scene) in enumerate(after):
-        moved = scene.poses - before.poses
-        assert (np.abs(moved[:, robot]).max(axis=-1) > 1e-3).all()
-        np.testing.assert_array_equal(moved[:, 1 - robot], 0.0)
-        np.testing.assert_array_equal(scene.layout.position, before.layout.position)
-        np.testing.assert_array_equal(scene.light.direction, before.light.direction)
-
-
 def test_look_is_centred_on_the_poi(looks):
     pois, before, (((pixels, _), _), ((ranges, expected), scene)) = looks
     red, green, _ = pixels.reshape(NUM_LOOKS, 80, 3)[:, 39:41].mean(axis=1).T

@@ -24,35 +24,10 @@ def with_bias(bias):
     return {"params": layers}
 
 
-def constant(gain, total):
+def constant(gain):
     """The same values of looks at every posterior."""
-    points = len(optimum.lattice(3))
-    tables = jnp.full(points, gain), jnp.full(points, total)
-    return LookValues(*tables, jnp.float32(gain), jnp.float32(total))
-
-
-def models_with(bias, values, fusion=None):
-    """What policies read, with a Q-network of the same values for every map."""
-    return models_of(
-        CONFIG, in_place() if fusion is None else fusion, values, (with_bias(bias),) * 2
-    )
-
-
-@jax.jit
-def play(modality, models, bank):
-    mdp = held_out_mdp(CONFIG, models.fusion, detections(held_out=bank))
-    return comparison.compare_policies(KEY, modality, models, mdp, CONFIG)
-
-
-# Every look of the camera pays until it has looked, by `optimal`.
-PAYS = constant(1.0, 1.0)
-
-
-def test_values_that_are_not_numbers_give_totals_that_are_none():
-    models = models_with(jnp.array([0.0, jnp.nan, 0.0, 1.0]), (PAYS, PAYS))
-    found = jax.tree.map(np.asarray, play(jnp.int32(0), models, EXACT))
-    assert all(np.isnan(x).all() for x in found.pop("latent"))
-    assert all(np.isfinite(x).all() for pair in found.values() for x in pair)
+    table = jnp.full(len(optimum.lattice(3)), gain)
+    return LookValues(table, table, *(jnp.float32(gain),) * 2)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +39,8 @@ def same_policy():
         jax.nn.softmax(3 * jax.random.normal(k, (3, 64, 2)))
         for k in jax.random.split(jax.random.key(3))
     )
-    models = models_with(jnp.zeros(4), (PAYS, PAYS))
+    q_networks = (with_bias(jnp.zeros(4)),) * 2
+    models = models_of(CONFIG, in_place(), (constant(1.0),) * 2, q_networks)
 
     @jax.jit
     def compared(models, config):

@@ -18,14 +18,14 @@ NOTHING = Looks(100 + jnp.arange(16.0).reshape(8, 2), jnp.ones(8))
 
 def given_to_detectors(windows, labels):
     """Inputs of a detector's stage, of one PoI a scene."""
+    classes = 2 * labels[:, None]  # a green cylinder, or a red cube
     number, scenes = len(labels), cast("Any", jnp.arange(len(labels)))
     of_both, distances = (windows[:, None],) * 2, jnp.ones((number, 2, 1))
-    survey = Survey(labels[:, None], scenes, of_both, distances)
-    others = Survey(labels[:, None], scenes, tuple(200 + x for x in of_both), distances)
+    survey = Survey(classes, scenes, of_both, distances)
+    others = Survey(classes, scenes, tuple(200 + x for x in of_both), distances)
     return {"surveys": Surveys(survey, others), "examples": (NOTHING, NOTHING)}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.25, 7)])
 def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
     config = dataclasses.replace(TINY.detector, calibration=share)

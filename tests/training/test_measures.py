@@ -136,12 +136,6 @@ def test_exact_bayes_reads_the_same_looks():
     assert np.all(np.diff(found["bayes_nll"]) <= 1e-6)
 
 
-def test_active_units_counts_dimensions_whose_means_vary():
-    # Variances of +-a: a^2 = 1, .0144, .0064 and 0, of which two exceed .01; an offset is no use.
-    mean = jnp.array([[1.0, 0.12, 0.08, 7.0], [-1.0, -0.12, -0.08, 7.0]])
-    assert measures.active_units(mean) == 2
-
-
 def test_moment_matching_error_as_worked_by_hand():
     # The components match N(2, 3^2) and N(1, .5^2), see test_gaussian.
     # Dimension 1: |3.5 - 2| / 3 + |ln(6/3)| = .5 + .693147; dimension 2: |.9 - 1| / .5 + 0 = .2.

@@ -78,14 +78,6 @@ def test_scenes_come_in_groups_that_show_the_same_pois():
     assert plain[3] is None
 
 
-def test_groups_hold_all_looks_at_one_poi():
-    # 8 scenes, 2 groups of 4 looks; 3 PoIs, windows of 2 numbers.
-    windows = jnp.arange(8 * 3 * 2.0).reshape(8, 3, 2)
-    found = scans.grouped(windows, TINY)
-    assert found.shape == (6, 4, 2)
-    np.testing.assert_array_equal(found[4], windows[4:, 1])
-
-
 def test_no_label_enters_the_training(learned):
     """Other labels of the same scenes change names, and nothing that is learned."""
     surveys = learned.outputs["survey"]

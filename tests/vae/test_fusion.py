@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.core.types import Belief
-from jaxsense.vae import filter, fusion, jmvae, readout
+from jaxsense.vae import fusion, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
 
 TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
@@ -82,17 +82,11 @@ def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
 
 
 CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-KINDS = {
-    "in_place": lambda: in_place(TWO, init(jax.random.key(0), TWO), CLASSES),
-    "filter": lambda: filter.init(
-        jax.random.key(0), TWO, CLASSES, fusion.prior(TWO, 20.0), hidden=(4,)
-    ),
-}
 
 
 def test_in_place_the_class_shown_is_not_one_that_the_belief_rules_out():
     # The mean of two classes may lie nearest to a third.
-    found = KINDS["in_place"]()
+    found = in_place(TWO, init(jax.random.key(0), TWO), CLASSES)
     for a, b in itertools.combinations(range(3), 2):
         halves = jnp.zeros(3).at[jnp.array([a, b])].set(0.5)
         belief = readout.mixture(found.classes, halves)

@@ -35,21 +35,19 @@ def zero_parameters(model):
     return jax.tree.map(np.zeros_like, init(jax.random.key(0), model))
 
 
-def with_output(params, part, name, output):
-    """Parameters with the bias of one network's last layer replaced."""
-    network = {"params": dict(params[part][name]["params"])}
-    network["params"]["Dense_1"] = {
-        **network["params"]["Dense_1"],
-        "bias": np.array(output, np.float32),
-    }
-    return {**params, part: {**params[part], name: network}}
+def with_output(params, name, output):
+    """Parameters with the bias of one encoder's last layer replaced."""
+    layers = params["encoders"][name]["params"]
+    last = {**layers["Dense_1"], "bias": np.array(output, np.float32)}
+    changed = {"params": {**layers, "Dense_1": last}}
+    return {**params, "encoders": {**params["encoders"], name: changed}}
 
 
 def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     model = Jmvae(THREE.modalities, THREE.feature_sizes, 1, (8,), max_subset=1)
     params = zero_parameters(model)
-    params = with_output(params, "encoders", "camera", [1.0, np.log(0.5)])
-    params = with_output(params, "encoders", "lidar", [3.0, np.log(0.25)])
+    params = with_output(params, "camera", [1.0, np.log(0.5)])
+    params = with_output(params, "lidar", [3.0, np.log(0.25)])
     assert params["encoders"].keys() == {"camera", "lidar", "sonar", "camera+lidar+sonar"}
     mean, log_var = encode(params, model, keep(some_features(model), (0, 1)))
     # The prior has precision 1, camera adds 1 and LiDAR 3: (2 x 1 + 4 x 3) / (1 + 1 + 3).
@@ -63,7 +61,7 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
 
 
 def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
-    params = with_output(zero_parameters(TWO), "encoders", "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
+    params = with_output(zero_parameters(TWO), "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
     features = keep(some_features(TWO), (1,))
     mean, log_var = encode(params, TWO, features)
     np.testing.assert_allclose(mean, [1.0, 2.0])
@@ -71,24 +69,6 @@ def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_var
     belief = jmvae.posterior(params, TWO, features)
     np.testing.assert_allclose(belief.mean, [1.0, 2.0])
     np.testing.assert_allclose(belief.std, [2.0, 1.0], rtol=1e-6)  # exp(ln(4) / 2) = 2
-
-
-def test_losses_of_a_batch_are_those_of_its_examples():
-    params = init(jax.random.key(0), THREE)
-    keys = jax.random.split(jax.random.key(1), 5)
-    examples = jax.vmap(lambda k: some_features(THREE, k))(jnp.arange(5))
-    options = {"alpha": 0.7, "beta": 0.3, "reconstruction_weights": (2.0, 0.5, 3.0)}
-    noise = jax.vmap(lambda k: jax.random.normal(k, (THREE.latent_size,)), out_axes=-1)(keys)
-    columns = tuple(x.T for x in examples)
-    together, parts = jax.jit(jmvae.losses, static_argnums=2)(
-        noise, params, THREE, columns, **options
-    )
-    assert together.shape == (5,)
-    for i, key in enumerate(keys):
-        alone, of_one = loss(key, params, THREE, tuple(x[i] for x in examples), **options)
-        np.testing.assert_allclose(together[i], alone, rtol=1e-5)
-        for name, part in of_one.items():
-            np.testing.assert_allclose(parts[name][i], part, rtol=1e-5)
 
 
 def test_beta_falls_by_equal_factors_to_its_last_value():

@@ -31,7 +31,7 @@ def test_a_mixture_has_the_moments_by_hand():
     np.testing.assert_allclose(found.std, [np.sqrt(0.16 + 1.0), 0.4], atol=1e-6)
 
 
-@pytest.mark.parametrize("variance", [20.0, 1.0, 0.01])
+@pytest.mark.parametrize("variance", [20.0, 0.01])
 def test_a_prior_may_be_of_any_class_however_wide_it_is(variance):
     # Of the classes in the first dimension, 1.2^2 + .4^2 = 1.6 is the largest mean square.
     prior = fusion.prior(MODEL, variance)
