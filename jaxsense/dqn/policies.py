@@ -207,7 +207,7 @@ def naive(number: int) -> Values:
 def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Takes every action with equal chance; one that does not exist is no operation in missions."""
     del models
-    number = len(known.looks) + 1
+    number = known.looks.shape[0] + 1
     return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
 
 
