@@ -216,7 +216,7 @@ def init(
     offset, scale = networks.statistics(windows)
     numbers = (1 + measures_distance) * len(offset) + 2
     params = networks.init(key, MLP(config.hidden, num_labels + 1), numbers)
-    threshold = jnp.finfo(jnp.float32).min
+    threshold = jnp.float32(jnp.finfo(jnp.float32).min)
     return Classifier(
         params, offset, scale, threshold, measures_distance, config.hidden, num_labels
     )
