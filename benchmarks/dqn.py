@@ -23,8 +23,9 @@ from jaxsense.tasks.score import Policy
 
 MODALITY = 0
 """The agent looks with the camera."""
-NUM_STARTS = 8192
-"""Prepared starts of episodes: a new one in each step would cost more than the step."""
+NUM_STARTS = 2048
+"""Prepared starts of episodes, as many as our own learner with its 128 environments has: a new one
+in each step would cost more than the step."""
 _UNIT = "env-steps/s"
 
 
@@ -85,6 +86,7 @@ class Dqn:
         discount = self.discount_of_a_second if is_team else self.discount
         agent = dataclasses.replace(agent, discount=discount)
         epochs = max(1, steps // self.num_envs)
+        epochs -= epochs % 100 if epochs > 100 else 0
         settings = DqnConfig(
             num_envs=self.num_envs,
             epochs=epochs,

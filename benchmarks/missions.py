@@ -5,7 +5,6 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import measure
@@ -85,8 +84,7 @@ def _play(
     """As many missions as each accelerator plays at once, or fewer on a CPU."""
     devices_of_sides, number = _sides(against_one)
     (total,) = measure.batches(options, quick=4, cpu=(cpu,), accelerator=(number * accelerator,))
-    # Until it is trained, a gate lets everything above minus infinity pass.
-    models = jax.tree.map(jnp.nan_to_num, init(jax.random.key(0), config))
+    models = init(jax.random.key(0), config)
     scenario, cases = mission.make_mission(config), {"naive": mission.cases(config)["naive"]}
 
     def side(compiler: Compiler, workers: Workers) -> Side:

@@ -31,7 +31,7 @@ _CONFIG = dataclasses.replace(
     jmvae=JmvaeConfig(samples_per_class=4096, steps=2000),
     dqn=DqnConfig(
         observe="bank",
-        epochs=400,
+        epochs=420,  # in chunks of 20, after each of which the policy is examined
         updates=8,
         batch=256,
         replay_capacity=65536,

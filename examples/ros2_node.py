@@ -13,6 +13,7 @@ import argparse
 import itertools
 import json
 import math
+import re
 import sys
 from collections import deque
 from collections.abc import Callable
@@ -269,7 +270,7 @@ def main() -> None:
     own = itertools.takewhile(lambda each: each != "--ros-args", sys.argv[1:])
     # With a space before it, argparse takes -1.2,0.8 for no option.
     arguments = parser.parse_args(
-        [f" {each}" if each[1:2] in "1234567890." else each for each in own]
+        [f" {each}" if re.match(r"-\.?\d", each) else each for each in own]
     )
     try:
         robot = Robot(*load(arguments.archive), arguments.robot, arguments.pois)

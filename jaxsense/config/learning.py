@@ -217,7 +217,9 @@ class DqnConfig(Section, place="dqn"):
     """Epochs between updates of the target network."""
 
     def check(self) -> None:
-        """Checks that all environments fill the replay together; raises `ConfigError`."""
+        """Checks that chunks are long and all environments fill the replay together."""
+        is_short = self.epochs <= _MOST_IN_CHUNK or self.epochs % 10 == 0
+        require(is_short, self, "epochs", f"must be at most {_MOST_IN_CHUNK} or a multiple of 10")
         is_multiple = self.replay_capacity % self.num_envs == 0
         expected = f"must be a multiple of num_envs = {self.num_envs}"
         require(is_multiple, self, "replay_capacity", expected)

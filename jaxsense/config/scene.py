@@ -43,7 +43,7 @@ MODALITIES: Mapping[str, str] = FrozenDict({"camera": "colour", "lidar": "shape"
 
 
 class Shape(Checked, place="shape"):
-    """A shape of PoIs: an upright cylinder or box, `arena.poi_height` high."""
+    """A shape of PoIs: an upright cylinder or box, `POI_HEIGHT` high."""
 
     primitive: Literal["cylinder", "box"]
     """The solid."""

@@ -194,8 +194,10 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], 
     sides = 2 * jnp.pi * jnp.arange(float(VIEW_SIDES)) / VIEW_SIDES
     nearest = config.viewpoint.min_distance + config.mission.localisation.search[0]
     nearest = jnp.maximum(config.arena.poi_extent + PLANNING_RADIUS, nearest)
-    distances = jnp.minimum(jnp.array(VIEW_DISTANCES), settings.view_range)
-    distances = jnp.maximum(distances, nearest)
+    # Within the limits of a look also after rounding.
+    margin = jnp.minimum(_MARGIN, (settings.view_range - nearest) / 4)
+    limits = nearest + margin, settings.view_range - margin
+    distances = jnp.clip(jnp.array(VIEW_DISTANCES), *limits)
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     positions = layout.position[:, None] + offsets[None]

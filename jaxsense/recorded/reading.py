@@ -1,6 +1,7 @@
 """Looks of real sensors, read from one file and checked against the sensors of a run."""
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -141,7 +142,9 @@ def resample(
         found = f"step between the rays of {sensor.name} = {between:.2f} degrees"
         raise ValueError(f"{found}: {expected}")
     needed = (sensor.window - 1) * sensor.stride + 1
-    number = int(resampling.covered(sensor.angles, angles, sensor.steps[1]).sum())
+    covered = resampling.covered(sensor.angles, angles, sensor.steps[1])
+    runs = (sum(1 for _ in run) for is_covered, run in itertools.groupby(covered) if is_covered)
+    number = max(runs, default=0)
     if number < needed:
         expected = f"must be at least {needed}, as wide as the window of its detector"
         raise ValueError(f"{number} rays of {sensor.name} were recorded: {expected}")

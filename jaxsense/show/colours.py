@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,12 +38,6 @@ def policy_colour(name: str) -> str:
 def policy_marker(name: str) -> str:
     """The marker of a policy, the same in all plots."""
     return _STYLES.get(name, _OWN_POLICY)[1]
-
-
-def series(number: int) -> dict[str, Any]:
-    """Colour and marker of a curve of no policy, sensor or class: those of a policy, in turn."""
-    colour, marker = [*_STYLES.values()][number % len(_STYLES)]
-    return {"color": colour, "marker": marker}
 
 
 def class_colour(arena: ArenaConfig, label: str) -> str:

@@ -44,7 +44,7 @@ class Rays(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Fan:
-    """Rays at equal angles, from right to left; one ray points ahead.
+    """Rays at equal angles, from right to left, around what is ahead.
 
     Attributes:
       num_rays: B.

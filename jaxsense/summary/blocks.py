@@ -109,7 +109,7 @@ class Grouped(TypedDict):
     """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
 
     pair: Annotated[float, Metric("right, one look each", "Share nearest to its cluster.", 4)]
-    all_looks: Annotated[float, Metric("right, all looks", "After `jmvae.looks` looks each.", 4)]
+    all_looks: Annotated[float, Metric("right, all looks", "After four looks each.", 4)]
 
 
 class Jmvae(TypedDict):

@@ -304,7 +304,7 @@ def accuracies(
       classes: `[C, D]` mean joint posterior of each class.
 
     Returns:
-      `pair` after one look by each sensor, and `all_looks` after `jmvae.looks` by each.
+      `pair` after one look by each sensor, and `all_looks` after four by each.
     """
     del key
     _, num_bank, num_held_out, _ = num_scenes(config)

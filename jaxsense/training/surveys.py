@@ -93,7 +93,7 @@ def draw_scenes(key: Key, config: Config) -> Scenes:
 
     Returns:
       `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, `[S]` bool, in which scenes
-      no look shows its PoI, and `[S]` keys of the PoIs' places, of which `jmvae.looks` in a row are
+      no look shows its PoI, and `[S]` keys of the PoIs' places, of which four in a row are
       the same if the JMVAE learns from groups of looks; otherwise None.
     """
     class_key, scene_key = jax.random.split(key)
