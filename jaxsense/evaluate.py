@@ -126,7 +126,8 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
-        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be used ({cli.reason(error)})")
+        done = "written" if isinstance(error, files.WriteError) else "used"
+        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be {done} ({cli.reason(error)})")
     _print(console, block, arguments.episodes)
     compilation, seconds = np.diff(times)
     rate = found.control_steps / seconds

@@ -218,8 +218,8 @@ class DqnConfig(Section, place="dqn"):
 
     def check(self) -> None:
         """Checks that chunks are long and all environments fill the replay together."""
-        is_short = self.epochs <= _MOST_IN_CHUNK or self.epochs % 10 == 0
-        require(is_short, self, "epochs", f"must be at most {_MOST_IN_CHUNK} or a multiple of 10")
+        is_even = self.epochs <= _MOST_IN_CHUNK or self.chunk >= 10
+        require(is_even, self, "epochs", f"must have a divisor from 10 to {_MOST_IN_CHUNK}")
         is_multiple = self.replay_capacity % self.num_envs == 0
         expected = f"must be a multiple of num_envs = {self.num_envs}"
         require(is_multiple, self, "replay_capacity", expected)
@@ -227,7 +227,9 @@ class DqnConfig(Section, place="dqn"):
     @property
     def chunk(self) -> int:
         """Epochs between reports of progress, which divide all epochs."""
-        return math.gcd(self.epochs, _MOST_IN_CHUNK)
+        if self.epochs % 10 == 0:
+            return math.gcd(self.epochs, _MOST_IN_CHUNK)
+        return max(n for n in range(1, _MOST_IN_CHUNK + 1) if self.epochs % n == 0)
 
     @property
     def num_starts(self) -> int:

@@ -169,7 +169,7 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
       base: as in `read`.
       common: options to show, in this order; by default all, by section.
     """
-    width = shutil.get_terminal_size().columns - 2
+    width = max(shutil.get_terminal_size().columns - 2, 20)
     options = {option.name: option for option in options_of(base)}
     positional = [_usage(each) for name, each in options.items() if not name.startswith("-")]
     title = (base.__doc__ or "").replace("`", "")
@@ -317,6 +317,8 @@ def _unknown(words: list[str], names: list[str]) -> str:
     word = next((word for word in words if word.startswith("-")), words[0])
     if not word.startswith("-"):
         return f"unexpected argument {_cut(word)!r}: options start with --"
+    if word[2:].removeprefix("no-").partition("=")[0].replace("-", "_") in _REMOVED:
+        return f"{_cut(word)} is no longer an option"
     near = _nearest(word[2:], [name[2:] for name in names if name.startswith("--")])
     hint = f"did you mean --{near[0]}?" if near else "see --help-all"
     return f"unknown option {_cut(word)}; {hint}"
@@ -388,10 +390,11 @@ def _made(kind: object, stored: object, base: object, place: str) -> object:
         return stored
     if not isinstance(stored, dict):
         raise ConfigError(place or "config", stored, "must be an object with names and values")
-    kinds, given = get_type_hints(kind), {}
+    kinds, given, former = get_type_hints(kind), {}, {}
     for name, value in stored.items():
         path = f"{place}.{name}".lstrip(".")
         if path in _REMOVED and json.loads(json.dumps(value)) in _REMOVED[path]:
+            former[name] = value
             continue
         if name in kinds:
             given[name] = _made(kinds[name], value, getattr(base, name, None), path)
@@ -403,11 +406,21 @@ def _made(kind: object, stored: object, base: object, place: str) -> object:
             hint = f"; did you mean {' or '.join(near)}?" if near else ""
             raise ConfigError(path, value, f"unknown setting{hint}")
     if base is not None:
-        return dataclasses.replace(cast(Any, base), **given)
+        made = dataclasses.replace(cast(Any, base), **given)
+        _check_former(made, former, place)
+        return made
     for field in dataclasses.fields(kind):
         if field.name not in given and field.default is dataclasses.MISSING:
             raise ConfigError(place, stored, f"missing setting {field.name}")
     return kind(**given)
+
+
+def _check_former(made: object, former: Mapping[str, object], place: str) -> None:
+    """Compares former settings with what follows from others now, a property of their name."""
+    for name, value in former.items():
+        follows = isinstance(getattr(type(made), name, None), property)
+        if follows and (now := getattr(made, name)) != value:
+            raise ConfigError(f"{place}.{name}", value, f"is no longer a setting: must be {now}")
 
 
 _REMOVED: Mapping[str, Sequence[object]] = {

@@ -261,8 +261,11 @@ def run_chunks(
     for chunk in range(done, stage.chunks):
         try:
             after, metrics = run(chunk, state)
-        except StageError:
-            checkpoints.save_unfinished(stage.name, Unfinished(chunk, state, curves))
+        except StageError as error:
+            try:
+                checkpoints.save_unfinished(stage.name, Unfinished(chunk, state, curves))
+            except OSError as lost:
+                raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
             raise
         state = after
         for name, values in metrics.items():
