@@ -291,6 +291,8 @@ def test_an_error_survives_pickling_and_shows_control_characters():
         ({"sensors": {"x": {"make": "a:b"}}}, "sensors.x = {'make': 'a:b'}: missing setting att"),
         ({"mission": {"attempts": 5}}, "mission.attempts = 5: is no longer a setting: must be 3"),
         ({"filter": {"hidden": [8]}}, "filter.hidden = [8]: is no longer a setting: must be [32]"),
+        ({"dqn": {"num_starts": 64}}, "dqn.num_starts = 64: is no longer a setting: must be 8192"),
+        ({"dqn": {"epochs": 997}}, "dqn.epochs = 997: must have a divisor from 10 to 100"),
     ],
 )
 def test_plain_settings_that_are_unknown_are_named(stored, expected):
