@@ -227,7 +227,7 @@ class DqnConfig(Section, place="dqn"):
     @property
     def chunk(self) -> int:
         """Epochs between reports of progress, which divide all epochs."""
-        if self.epochs % 10 == 0:
+        if self.epochs <= _MOST_IN_CHUNK or self.epochs % 10 == 0:
             return math.gcd(self.epochs, _MOST_IN_CHUNK)
         return max(n for n in range(1, _MOST_IN_CHUNK + 1) if self.epochs % n == 0)
 
