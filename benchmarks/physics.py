@@ -17,7 +17,7 @@ from benchmarks.measure import Options, Row, Side
 from benchmarks.missions import PERIODS_BEFORE, untrained
 from benchmarks.peers import native
 from jaxsense import Config, init, mission
-from jaxsense.config import CONTROL_PERIOD
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.mission import Mission, MissionState, navigation
 from jaxsense.mission.rollout import move
 from jaxsense.mission.rollout import step as mission_step

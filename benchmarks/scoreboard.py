@@ -23,8 +23,8 @@ from benchmarks.dqn import Dqn
 from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields, limited, require
 from jaxsense.run import cli
-from jaxsense.tasks import Recurrent, Task, estimate
-from jaxsense.tasks.score import Policy
+from jaxsense.tasks import Recurrent, Task
+from jaxsense.tasks.score import Policy, estimate
 
 PROGRAM = "benchmarks.scoreboard"
 STEPS = {

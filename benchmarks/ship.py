@@ -15,7 +15,8 @@ import jax
 
 import jaxsense
 from jaxsense import Config
-from jaxsense.tasks import PRETRAINED, Origin, pretrained, registry
+from jaxsense.tasks import PRETRAINED, pretrained, registry
+from jaxsense.tasks.pretrained import Origin
 
 _KEY = 20261126
 _LOOKS = 12288  # by each sensor, at all classes together

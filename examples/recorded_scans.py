@@ -26,13 +26,13 @@ import numpy as np
 
 import jaxsense
 from jaxsense import recorded, sim
-from jaxsense.config import Search
+from jaxsense.config.mission import Search
 from jaxsense.recorded import RecordedLooks
 
 
 def read(config: jaxsense.Config, models: jaxsense.Models, looks: RecordedLooks) -> None:
     """Prints what the map makes of recorded looks."""
-    fusion, sensors = models.fusion, sim.sensors.make(config)
+    fusion, sensors = models.fusion, sim.make_world(config).sensors
     views = {name: looks.seen_from(name) for name in looks.scans}
     for n in range(len(looks.positions)):
         print(f"PoI {n + 1}")

@@ -14,9 +14,10 @@ import rich.console
 import rich.table
 
 from jaxsense import mission, summary
-from jaxsense.config import CONTROL_PERIOD, TIMESTEP, Config, ConfigError
-from jaxsense.config.mission import MAX_EPISODES
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.mission import CONTROL_PERIOD, MAX_EPISODES
 from jaxsense.config.options import Name
+from jaxsense.config.scene import TIMESTEP
 from jaxsense.config.section import check_fields, limited, require
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler

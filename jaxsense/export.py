@@ -21,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from jaxsense.config import MAX_BEARING, POI_HEIGHT, Config, ConfigError, Search
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.mission import Search
 from jaxsense.config.options import Name
+from jaxsense.config.scene import MAX_BEARING, POI_HEIGHT
 from jaxsense.config.section import check_fields
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known

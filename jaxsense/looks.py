@@ -13,7 +13,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import PLANNING_RADIUS, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import checks
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.dqn import rewards
@@ -151,7 +152,7 @@ def surveys(
     is_empty: Bool[Array, " S"] | None = None,
     places: Key | None = None,
 ) -> tuple[Scene, tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
-    """Surveys many scenes, see `sim.survey`.
+    """Surveys many scenes, see `sim.world.survey`.
 
     Returns:
       `[S]` scenes, for each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import MAX_BEARING, Config, Search
+from jaxsense.config import Config
+from jaxsense.config.mission import Search
+from jaxsense.config.scene import MAX_BEARING
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
@@ -122,7 +124,7 @@ class Models:
         return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
-        """Classes that are plausible given a `[D]` belief, see `vae.plausible_classes`."""
+        """Classes that are plausible given a `[D]` belief, see `vae.readout`."""
         return readout.plausible_classes(belief, self.fusion.classes.mean)
 
 

@@ -13,6 +13,9 @@ from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
 from jaxsense.show.terminal import as_text
 from jaxsense.tasks import Task
+from jaxsense.tasks.registry import about, agents
+from jaxsense.tasks.score import estimate
+from jaxsense.tasks.task import EPISODES, SEEDS
 
 PROGRAM = "jaxsense tasks"
 SCOREBOARD = "docs/tasks.md"
@@ -35,12 +38,12 @@ def main(argv: list[str] | None = None) -> None:
         devices.start(1)
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
-    found = [tasks.make(name, agent) for name in tasks.registered() for agent in tasks.agents(name)]
+    found = [tasks.make(name, agent) for name in tasks.registered() for agent in agents(name)]
     tell(as_text(rich.console.Console(), _table(found)))
     for name in tasks.registered():
-        tell(f"{name}: {tasks.about(name)}.")
+        tell(f"{name}: {about(name)}.")
     tell(
-        f"Returns are interquartile means over {tasks.SEEDS} seeds of {tasks.EPISODES:,} episodes, "
+        f"Returns are interquartile means over {SEEDS} seeds of {EPISODES:,} episodes, "
         f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies.\n"
         'Next, in Python: jaxsense.score("noisy-v0", policy)'
     )
@@ -52,7 +55,7 @@ def _table(found: list[Task]) -> Table:
 
     def row(task: Task) -> tuple[str, list[str]]:
         known = {
-            name: f"{tasks.estimate(returns).value:.3f}"
+            name: f"{estimate(returns).value:.3f}"
             for name, returns in zip(task.references, np.asarray(task.returns), strict=True)
         }
         best = next(iter(known))

@@ -18,10 +18,12 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import mission, summary
-from jaxsense.config import PRESETS, Config, ConfigError, PresetName
+from jaxsense import summary
+from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.config.section import check_fields, limited, require
+from jaxsense.config.whole import PresetName
+from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -167,7 +169,7 @@ def parse(
             num_seeds=stored.num_seeds,
         )
         arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
-        mission.require_playable(arguments.config, policies)
+        require_playable(arguments.config, policies)
         if arguments.tensorboard:
             terminal.require_tensorboard()
         if arguments.file is not None and arguments.preset != stored.preset:

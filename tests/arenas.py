@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig
+from jaxsense.config.scene import ArenaConfig
+from jaxsense.sim.arena import build
 
 
 @pytest.fixture(scope="session")
 def arena():
     """An arena without contacts, in which robot 1 carries the laser scanner."""
-    return sim.build(ArenaConfig(), (False, True), contacts=False)
+    return build(ArenaConfig(), (False, True), contacts=False)
 
 
 @pytest.fixture(scope="session")

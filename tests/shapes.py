@@ -11,6 +11,9 @@ from typing import get_args
 import beartype
 import jaxtyping
 
+from jaxsense.vae.detectors import detect
+from jaxsense.vae.gaussian import kl_divergence
+
 _CONFIG = beartype.BeartypeConf(is_pep484_tower=True)  # an int is a float
 CHECKED = set[str]()
 """Names of the functions whose arrays are checked."""
@@ -64,10 +67,10 @@ def main() -> None:
     vae.bayes_update(two, look, jnp.arange(2))
     models.fusion.update(models.fusion.prior, seen, look, 1)
     wrong = {
-        "kl_divergence": lambda: vae.kl_divergence(two, two, jnp.zeros(3), two),
+        "kl_divergence": lambda: kl_divergence(two, two, jnp.zeros(3), two),
         "bayes_update": lambda: vae.bayes_update(two, look, jnp.zeros(2)),
         "observe": lambda: mdp.looks.observe(KEY, jnp.arange(3), jnp.arange(1), 0),
-        "detect": lambda: vae.detect(models.detectors[0], jnp.zeros((1, 240)), jnp.ones(())),
+        "detect": lambda: detect(models.detectors[0], jnp.zeros((1, 240)), jnp.ones(())),
         "update": lambda: models.fusion.update(models.fusion.prior, two, look, 1),
     }
     refused = {}

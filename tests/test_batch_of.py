@@ -7,7 +7,8 @@ import pytest
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.config import PRESETS, CommunicationConfig
+from jaxsense.config import PRESETS
+from jaxsense.config.mission import CommunicationConfig
 from jaxsense.run import devices, ledger
 from jaxsense.run.devices import Workers
 

@@ -18,6 +18,8 @@ from jaxsense import __main__ as commands
 from jaxsense import demo, export, mission, task_list, tasks
 from jaxsense.run import output
 from jaxsense.run.missions import Played
+from jaxsense.tasks.registry import about, agents
+from jaxsense.tasks.score import estimate
 
 ROOT = Path(__file__).parents[1]
 
@@ -61,13 +63,13 @@ def test_tasks_are_listed_with_the_returns_of_their_files(capsys):
     task_list.main([])
     text = capsys.readouterr().out
     for name in tasks.registered():
-        assert f"{name}: {tasks.about(name)}." in text
-        for agent in tasks.agents(name):
+        assert f"{name}: {about(name)}." in text
+        for agent in agents(name):
             task = jaxsense.make(name, agent)
             assert task.agent == agent
             best, *_ = np.asarray(task.returns)
             cells = f"{agent} +{task.observation_size} +{task.num_actions} "
-            cells += rf" +{tasks.estimate(best).value:.3f} {task.references[0]} "
+            cells += rf" +{estimate(best).value:.3f} {task.references[0]} "
             assert re.search(cells, text)
 
 

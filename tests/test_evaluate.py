@@ -19,7 +19,8 @@ from smoke import MISSION_KEYS, error_line
 
 import jaxsense
 from jaxsense import dqn, evaluate, export, mission
-from jaxsense.config import CONTROL_PERIOD, PRESETS, ConfigError
+from jaxsense.config import PRESETS, ConfigError
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.run import cli, devices, missions, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor

@@ -9,7 +9,8 @@ import pytest
 
 import jaxsense
 from jaxsense import sim
-from jaxsense.config import ViewpointConfig
+from jaxsense.config.scene import ViewpointConfig
+from jaxsense.sim.viewpoints import bearing
 
 SCENES = 800
 
@@ -38,7 +39,7 @@ def scans(trained, m, near, far, seed=0):
             rays = sensor.directions
             readings = sim.scan(noise_key, sensor, world.arena, data, layout, light, m, rays)
             place, pose = scene.layout.position[0], scene.poses[m]
-            return readings, sim.bearing(pose, place), jnp.linalg.norm(place - pose[:2])
+            return readings, bearing(pose, place), jnp.linalg.norm(place - pose[:2])
 
         return jax.lax.map(one, (keys, classes), batch_size=100)
 

@@ -10,7 +10,8 @@ import pytest
 
 import jaxsense
 from jaxsense import looks
-from jaxsense.config import PLANNING_RADIUS, PRESETS, JmvaeConfig
+from jaxsense.config import PRESETS, JmvaeConfig
+from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.dqn import map_mdp, rewards

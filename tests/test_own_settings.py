@@ -10,23 +10,20 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import (
-    COLOURS,
-    MODALITIES,
     PRESETS,
-    SHAPES,
-    ArenaConfig,
     Attribute,
     Config,
     ConfigError,
     MdpConfig,
     SensorConfig,
     Shape,
-    TeamConfig,
-    TravelConfig,
     as_plain,
     from_plain,
 )
+from jaxsense.config.learning import TeamConfig, TravelConfig
+from jaxsense.config.scene import COLOURS, MODALITIES, SHAPES, ArenaConfig
 from jaxsense.dqn import rewards
+from jaxsense.sim.sensors import on_top
 
 TEMPERATURE = {"temperature": Attribute({"cold": 5.0, "hot": 60.0})}
 WARM = ArenaConfig(attributes=TEMPERATURE, classes=("red cube hot", "green cylinder cold"))
@@ -58,7 +55,7 @@ def test_a_sensor_above_the_body_makes_its_robot_as_tall(own_sensors):
     names = ("lidar", "thermal", "thermal")
     for height, expected in ((0.09, (True, False, False)), (0.12, (True, True, True))):
         own_sensors.thermal = lambda config, height=height: thermal(config, height=height)
-        assert sim.sensors.on_top(OWN, names) == expected
+        assert on_top(OWN, names) == expected
     world = sim.world.make_world(OWN, ("thermal",))
     assert world.arena.mj_model.geom("robot0_lidar").pos[2] > 0.09
 
@@ -155,7 +152,7 @@ def test_a_sensor_that_does_not_fit_is_named(own_sensors, function, expected):
     if function is not None:
         own_sensors.thermal = function
     with pytest.raises(ConfigError) as error:
-        sim.sensors.make(OWN)
+        sim.make_world(OWN)
     assert expected in str(error.value)
 
 

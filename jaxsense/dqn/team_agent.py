@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.config import TeamConfig
+from jaxsense.config.learning import TeamConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Index, Key, Transition, pytree

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import TeamConfig
+from jaxsense.config.learning import TeamConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, Key, pytree
 from jaxsense.dqn import map_mdp

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import ToursConfig
+from jaxsense.config.learning import ToursConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Key, pytree

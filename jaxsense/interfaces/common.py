@@ -11,7 +11,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.config import Config, ConfigError, names_of_robots
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.whole import names_of_robots
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import team_mdp

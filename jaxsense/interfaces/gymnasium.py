@@ -30,7 +30,7 @@ class MapVectorEnv(VectorEnv):
     """A vector environment, stepped by one compiled program.
 
     It plays a task, in which one policy chooses, for a team for the robot whose turn it is; or the
-    map MDP of one agent, whose observations are the `[N * 2D]` map, see `dqn.observation`. Action
+    map MDP of one agent, whose observations are the `[N * 2D]` map. Action
     n < N looks at PoI n; action N is NOP. `action_mask` in the infos, `[E, N + 1]` int8, is 1 for
     the actions that exist. The methods are Gymnasium's.
     """

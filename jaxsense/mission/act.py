@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 from mujoco import mjx
 
-from jaxsense.config import CONTROL_PERIOD, Search
+from jaxsense.config.mission import CONTROL_PERIOD, Search
 from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import navigation, roadmap
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees

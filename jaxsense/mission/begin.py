@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsense.config import PLANNING_RADIUS, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.mission import maps, roadmap

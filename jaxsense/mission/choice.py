@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import MissionConfig
+from jaxsense.config.mission import MissionConfig
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import policies, team_mdp
 from jaxsense.dqn.policies import Known, Policy

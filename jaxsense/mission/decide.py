@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import MARGIN
+from jaxsense.config.mission import MARGIN
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.team_mdp import Team, Travel

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from jaxsense.config import CommunicationConfig
+from jaxsense.config.mission import CommunicationConfig
 from jaxsense.core.types import Belief, Fusion, Index, Key, product, pytree
 from jaxsense.models import Models
 from jaxsense.vae import readout

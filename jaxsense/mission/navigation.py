@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import PLANNING_RADIUS, ArenaConfig
+from jaxsense.config.mission import PLANNING_RADIUS
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.core.types import Index, others, product
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout

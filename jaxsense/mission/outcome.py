@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PyTree
 
-from jaxsense.config import CONTROL_PERIOD, Config, ConfigError
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.scene import require_words
 from jaxsense.core import checks
 from jaxsense.dqn import rewards

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import MARGIN, NODES_PER_POI, PLANNING_RADIUS, VIEW_SIDES, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import MARGIN, NODES_PER_POI, PLANNING_RADIUS, VIEW_SIDES
 from jaxsense.core import checks
 from jaxsense.core.types import Index, pytree
 from jaxsense.sim import viewpoints

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import CONTROL_PERIOD, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, pytree
 from jaxsense.mission import act, decide, navigation

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import CONTROL_PERIOD, Config, ConfigError
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.section import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree

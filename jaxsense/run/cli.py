@@ -8,7 +8,8 @@ from typing import NoReturn, TypeVar
 
 import jax
 
-from jaxsense.config import Config, ConfigError, options, require_32_bits
+from jaxsense.config import Config, ConfigError, options
+from jaxsense.config.section import require_32_bits
 from jaxsense.run import kept
 from jaxsense.run.kept import Kept
 from jaxsense.run.output import complain, tell

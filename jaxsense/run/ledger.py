@@ -6,7 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxsense.config import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES
 from jaxsense.mission.maps import MOST_LOOKS
 from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.run import devices

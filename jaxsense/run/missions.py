@@ -13,18 +13,10 @@ from jaxtyping import Array, Bool, Int, PyTree
 
 from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
-from jaxsense.mission import (
-    Case,
-    Faults,
-    Mission,
-    MissionState,
-    Record,
-    make_mission,
-    measure,
-    no_faults,
-    reset,
-    rollout_batch,
-)
+from jaxsense.mission import Case, Mission, MissionState, Record, make_mission, reset
+from jaxsense.mission.outcome import measure
+from jaxsense.mission.rollout import rollout_batch
+from jaxsense.mission.state import Faults, no_faults
 from jaxsense.models import Models, init
 from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
@@ -57,7 +49,7 @@ class Played:
     """The results of many missions.
 
     Attributes:
-      metrics: `[episodes, ...]` metrics of each case; see `mission.measure`.
+      metrics: `[episodes, ...]` metrics of each case; see `mission.outcome.measure`.
       recording: the first mission of the first case.
       control_steps: total number of control periods, until each mission's end.
       naive: the same mission under naive exploration; None if it was not played, or if the first
@@ -95,7 +87,7 @@ class _Found:
       chunks: played so far.
       is_finite: whether their beliefs are finite.
       has_values: whether no policy returned NaN.
-      metrics: see `mission.measure`.
+      metrics: see `mission.outcome.measure`.
     """
 
     done: Bool[Array, " B"]

@@ -11,6 +11,7 @@ from jaxsense import mission, summary
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
+from jaxsense.mission.outcome import require_playable
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
@@ -81,9 +82,9 @@ def compiled(
     Keep no programs with custom policies, whose code may change.
 
     Raises:
-      ConfigError: see `mission.require_playable`.
+      ConfigError: see `require_playable`.
     """
-    mission.require_playable(config, policies)
+    require_playable(config, policies)
     with Compiler(monitor, kept) as compiler:
         yield Programs(config, compiler, workers, trainings, policies)
 

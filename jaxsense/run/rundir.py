@@ -17,7 +17,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, parse_json, require_32_bits
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.options import parse_json
+from jaxsense.config.section import require_32_bits
 from jaxsense.core import inside
 from jaxsense.models import Models
 from jaxsense.run import files, output, version

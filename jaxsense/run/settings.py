@@ -8,15 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias
 
-from jaxsense.config import (
-    PRESETS,
-    Config,
-    ConfigError,
-    as_plain,
-    from_plain,
-    parse_json,
-    require_trust,
-)
+from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
+from jaxsense.config.options import parse_json, require_trust
 from jaxsense.config.section import check_fields
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions

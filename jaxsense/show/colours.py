@@ -6,7 +6,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxsense.config import ArenaConfig
+from jaxsense.config.scene import ArenaConfig
 
 MARKERS = "oDs^vPX<>pdh"
 SOFT = "#59616e"

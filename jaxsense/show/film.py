@@ -8,7 +8,8 @@ from xml.etree.ElementTree import Element
 import jax
 import numpy as np
 
-from jaxsense.config import CONTROL_PERIOD, Config
+from jaxsense.config import Config
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core.types import Belief, Fusion
 from jaxsense.mission import MissionState, Record
 from jaxsense.show.colours import modality_colour

@@ -9,7 +9,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxsense.config import ROBOT_RADIUS, Config
+from jaxsense.config import Config
+from jaxsense.config.scene import ROBOT_RADIUS
 from jaxsense.core.types import Fusion
 from jaxsense.mission import MissionState, Record
 from jaxsense.mission.state import ENDED, FACING

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 
 from jaxsense.config import ConfigError
-from jaxsense.mission import is_fault
+from jaxsense.mission.outcome import is_fault
 from jaxsense.summary import Case, Missions, Results, cases
 from jaxsense.summary.blocks import (
     AGENTS,

@@ -7,17 +7,10 @@ with contextlib.redirect_stdout(io.StringIO()):
     # On import, MJX prints that NVIDIA Warp is not installed; nothing here uses it.
     import mujoco.mjx as _  # noqa: F401
 
-from jaxsense.sim import sensors as sensors
-from jaxsense.sim import windows as windows
-from jaxsense.sim.arena import build as build
-from jaxsense.sim.arena import drive as drive
 from jaxsense.sim.arena import make_layout as make_layout
 from jaxsense.sim.arena import place as place
 from jaxsense.sim.arena import random_layout as random_layout
-from jaxsense.sim.arena import robot_poses as robot_poses
 from jaxsense.sim.domain import Domain as Domain
-from jaxsense.sim.light import Light as Light
-from jaxsense.sim.light import random_light as random_light
 from jaxsense.sim.raycast import CrossSection as CrossSection
 from jaxsense.sim.raycast import Fan as Fan
 from jaxsense.sim.raycast import Pinhole as Pinhole
@@ -26,11 +19,9 @@ from jaxsense.sim.raycast import choose as choose
 from jaxsense.sim.raycast import cross_section as cross_section
 from jaxsense.sim.sensors import Sensor as Sensor
 from jaxsense.sim.sensors import scan as scan
-from jaxsense.sim.viewpoints import bearing as bearing
 from jaxsense.sim.windows import cut_out as cut_out
 from jaxsense.sim.world import Scene as Scene
 from jaxsense.sim.world import World as World
 from jaxsense.sim.world import look as look
 from jaxsense.sim.world import make_world as make_world
 from jaxsense.sim.world import random_scene as random_scene
-from jaxsense.sim.world import survey as survey

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsense.config import ArenaConfig, ViewpointConfig
+from jaxsense.config.scene import ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Index, Key, pytree
 from jaxsense.sim import amiro
 from jaxsense.sim.sensors import Sensor

@@ -6,7 +6,7 @@ velocity servos that push the body at the wheels' positions; a third, passive ac
 from sliding sideways. A wheel that cannot reach its speed with the servo's force slips.
 """
 
-from jaxsense.config import ROBOT_RADIUS
+from jaxsense.config.scene import ROBOT_RADIUS
 
 BODY_RADIUS = ROBOT_RADIUS
 BODY_HEIGHT = 0.084  # m

@@ -17,7 +17,8 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import POI_HEIGHT, TIMESTEP, ArenaConfig, Shape
+from jaxsense.config import Shape
+from jaxsense.config.scene import POI_HEIGHT, TIMESTEP, ArenaConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro

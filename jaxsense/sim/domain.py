@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import MAX_BEARING, Config
+from jaxsense.config import Config
+from jaxsense.config.scene import MAX_BEARING
 from jaxsense.core.types import pytree
 from jaxsense.sim import windows
 from jaxsense.sim.sensors import Sensor

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsense.config import LocalisationConfig
+from jaxsense.config.mission import LocalisationConfig
 from jaxsense.core.types import Key
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsense.config import Search
+from jaxsense.config.mission import Search
 from jaxsense.core.types import pytree
 from jaxsense.sim import windows
 from jaxsense.sim.sensors import Sensor

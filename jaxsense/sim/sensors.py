@@ -17,14 +17,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
-from jaxsense.config import (
-    LIDAR_HEIGHT,
-    POI_HEIGHT,
-    CameraConfig,
-    Config,
-    ConfigError,
-    LidarConfig,
-)
+from jaxsense.config import CameraConfig, Config, ConfigError, LidarConfig
+from jaxsense.config.scene import LIDAR_HEIGHT, POI_HEIGHT
 from jaxsense.config.section import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree

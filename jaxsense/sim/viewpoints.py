@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsense.config import CLEARANCE, MAX_BEARING, ArenaConfig, ViewpointConfig
+from jaxsense.config.scene import CLEARANCE, MAX_BEARING, ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Index, Key
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout

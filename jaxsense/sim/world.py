@@ -8,7 +8,10 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import Config, LocalisationConfig, ViewpointConfig, require_32_bits
+from jaxsense.config import Config
+from jaxsense.config.mission import LocalisationConfig
+from jaxsense.config.scene import ViewpointConfig
+from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.sim import absence, localisation, sensors, viewpoints, windows

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
 
-from jaxsense.mission import is_fault
+from jaxsense.mission.outcome import is_fault
 
 
 class Interval(TypedDict):

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import PyTree
 
-from jaxsense.mission import is_fault
+from jaxsense.mission.outcome import is_fault
 from jaxsense.summary import blocks
 from jaxsense.summary.blocks import Case, Interval, Missions, Origin, Results, Summary, cases, mean
 
@@ -18,7 +18,7 @@ AS_ACCURATE = 0.005
 """Difference of accuracies that does not matter when times and looks are compared."""
 
 Measured = Mapping[str, PyTree[np.ndarray]]
-"""`[E, ...]` metrics of the missions of a case, see `mission.measure`."""
+"""`[E, ...]` metrics of the missions of a case, see `mission.outcome.measure`."""
 
 UNKNOWN: Origin = {"versions": {}, "devices": []}
 """Origin of figures that do not tell it."""

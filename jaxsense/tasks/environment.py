@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.config import require_32_bits
+from jaxsense.config.section import require_32_bits
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.dqn import map_mdp
 from jaxsense.dqn.map_agent import observation

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, as_plain, from_plain, require_32_bits
+from jaxsense.config import Config, ConfigError, as_plain, from_plain
+from jaxsense.config.section import require_32_bits
 from jaxsense.models import Models
 
 T = TypeVar("T")

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, require_32_bits
+from jaxsense.config import Config, ConfigError
+from jaxsense.config.section import require_32_bits
 from jaxsense.core.types import Key, Samples
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models

@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import FilterConfig
+from jaxsense.config.learning import FilterConfig
 from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, Samples, product, pytree

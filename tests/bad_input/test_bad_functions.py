@@ -13,8 +13,13 @@ from untrained import untrained
 import jaxsense
 from jaxsense import Belief, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.dqn import replay
-from jaxsense.mission import roadmap
-from jaxsense.vae import filter
+from jaxsense.dqn.optimum import interpolate
+from jaxsense.dqn.rewards import information
+from jaxsense.mission import begin, roadmap
+from jaxsense.mission.state import Faults, no_faults
+from jaxsense.sim.light import random_light
+from jaxsense.vae import filter, jmvae
+from jaxsense.vae.readout import nearest_class
 
 # Settings whose models have other shapes.
 OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, latent_size=3))
@@ -33,7 +38,7 @@ class World:
         self.mission = mission.make_mission(SMOKE, arenas=(self.world.arena,) * 2)
         self.classes = jnp.array([0, 1, 2])
         layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
-        light = sim.random_light(self.key)
+        light = random_light(self.key)
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
         classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
         prior = vae.prior(self.model, 20.0)
@@ -81,7 +86,7 @@ def of_missions(w, config=SMOKE, models=None, policies=None, **options):
 
 def loss(w, features, weights=(1.0, 1.0)):
     """A loss of some features."""
-    return vae.loss(
+    return jmvae.loss(
         w.key,
         w.params,
         w.model,
@@ -254,15 +259,15 @@ FUNCTIONS = {
         "largest of log_weights = -inf: must be finite",
     ),
     "interpolate": (
-        lambda w: dqn.interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)),
+        lambda w: interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)),
         "length of table = 7: must be 6 or another size of a grid",
     ),
     "prior": (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
     "nearest_class": (
-        lambda w: vae.nearest_class(w.belief_of(mean=w.x * NAN), w.means),
+        lambda w: nearest_class(w.belief_of(mean=w.x * NAN), w.means),
         "belief.mean = nan: must be finite",
     ),
-    "information zero": (lambda w: dqn.information(w.x), "std = 0.0: must be greater than 0"),
+    "information zero": (lambda w: information(w.x), "std = 0.0: must be greater than 0"),
     "reset classes": (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
     "step action": (
         lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4), 0),
@@ -294,15 +299,15 @@ def test_functions_refuse(given_world, name):
         ({"policy": 12}, "policy = 12: must be a whole number from 0 to 11"),
         ({"policy": -1}, "policy = -1"),
         ({"classes": BAD}, "classes = 7"),
-        ({"faults": mission.Faults(jnp.full(2, NAN), jnp.zeros(2))}, "faults.stops_at = nan"),
-        ({"faults": mission.Faults(jnp.zeros(2), -jnp.ones(2))}, "faults.blind_at = -1.0"),
+        ({"faults": Faults(jnp.full(2, NAN), jnp.zeros(2))}, "faults.stops_at = nan"),
+        ({"faults": Faults(jnp.zeros(2), -jnp.ones(2))}, "faults.blind_at = -1.0"),
     ],
 )
 def test_a_mission_refuses(given_world, inputs, expected):
     team, models = given_world.mission, given_world.models
-    base = {"classes": given_world.classes, "policy": 0, "faults": mission.no_faults(SMOKE)}
+    base = {"classes": given_world.classes, "policy": 0, "faults": no_faults(SMOKE)}
     with pytest.raises(ValueError, match=re.escape(expected)):
-        mission.start(team, models, given_world.scene, **{**base, **inputs})
+        begin.start(team, models, given_world.scene, **{**base, **inputs})
 
 
 def test_environments_refuse(given_world):

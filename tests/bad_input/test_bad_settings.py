@@ -16,7 +16,9 @@ from hypothesis import strategies as st
 from refusals import ANYTHING, FIELDS, NAN, NUMBERS, PARTS, SECTIONS, SMOKE, check_message
 
 from jaxsense import PRESETS, Attribute, Config, ConfigError, SensorConfig, Shape, learn
-from jaxsense.config import COLOURS, SHAPES, ArenaConfig, CommunicationConfig, as_plain, from_plain
+from jaxsense.config import as_plain, from_plain
+from jaxsense.config.mission import CommunicationConfig
+from jaxsense.config.scene import COLOURS, SHAPES, ArenaConfig
 
 
 def message(change, *args, **kwargs) -> str:

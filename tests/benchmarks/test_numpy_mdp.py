@@ -8,7 +8,8 @@ import pytest
 from benchmarks.dqn import untrained_task
 from benchmarks.peers.numpy_mdp import NumpyMdp
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import map_mdp, observation
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_agent import observation
 
 TOLERANCE = 1e-5  # latent units, over a few float32 layers
 

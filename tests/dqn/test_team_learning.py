@@ -16,7 +16,8 @@ from toys import (
     team_mdp_of,
 )
 
-from jaxsense.config import DqnConfig, TeamConfig
+from jaxsense.config import DqnConfig
+from jaxsense.config.learning import TeamConfig
 from jaxsense.dqn import map_mdp, team_mdp, training
 from jaxsense.dqn.team_agent import TeamAgent
 

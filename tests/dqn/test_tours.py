@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from toys import Fixed, classes_mdp, team_mdp_of
 
-from jaxsense.config import TeamConfig, ToursConfig
+from jaxsense.config.learning import TeamConfig, ToursConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import team_mdp, tours

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxsense.config import MdpConfig, TeamConfig
+from jaxsense.config import MdpConfig
+from jaxsense.config.learning import TeamConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import policies, rewards, team_mdp
 from jaxsense.dqn.map_mdp import MapMdp

@@ -12,6 +12,7 @@ import jaxsense
 from jaxsense import export, mission
 from jaxsense.interfaces import robot
 from jaxsense.mission import decide
+from jaxsense.mission.rollout import rollout_batch
 
 ENOUGH = 40
 
@@ -38,7 +39,7 @@ def test_an_archive_chooses_as_the_robots_of_missions_do(preset):
             found.append((due, inputs, chosen))
         return found
 
-    advance = jax.jit(lambda keys, s: mission.rollout_batch(keys, made, models, s, 1, len(keys)))
+    advance = jax.jit(lambda keys, s: rollout_batch(keys, made, models, s, 1, len(keys)))
     keys = jax.random.split(jax.random.key(0), 8)
     states, count, actions = jax.vmap(lambda key: mission.reset(key, made, models))(keys), 0, set()
     while count < ENOUGH and not states.done.all():

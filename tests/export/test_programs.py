@@ -17,7 +17,8 @@ from jaxsense import export
 from jaxsense.config import PRESETS
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn import Travel, observation, team_mdp
+from jaxsense.dqn import Travel, team_mdp
+from jaxsense.dqn.map_agent import observation
 from jaxsense.interfaces import robot
 from jaxsense.models import make_jmvae
 from jaxsense.run.version import __version__

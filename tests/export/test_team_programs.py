@@ -12,7 +12,8 @@ from exporting import CONFIG, EXAMPLE, drawn
 
 import jaxsense
 from jaxsense import export
-from jaxsense.config import PRESETS, CommunicationConfig
+from jaxsense.config import PRESETS
+from jaxsense.config.mission import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief

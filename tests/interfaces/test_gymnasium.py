@@ -21,7 +21,8 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import jaxsense
 from jaxsense.config import ConfigError
-from jaxsense.dqn import map_mdp, observation
+from jaxsense.dqn import map_mdp
+from jaxsense.dqn.map_agent import observation
 from jaxsense.interfaces import gymnasium as ours
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv

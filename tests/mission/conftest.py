@@ -9,7 +9,9 @@ from teams import CONFIG, NAIVE, alone, decide_alone, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.mission import act
+from jaxsense.mission import act, begin
+from jaxsense.mission.state import no_faults
+from jaxsense.sim.light import Light
 
 
 @pytest.fixture(scope="session")
@@ -29,14 +31,14 @@ def arena_of(team, models):
     @jax.jit
     def start(positions, poses, classes, policy, faults):
         layout = jaxsense.sim.make_layout(CONFIG.arena, positions, jnp.zeros(len(classes)), classes)
-        light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
-        return mission.start(
+        light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
+        return begin.start(
             team, models, jaxsense.sim.Scene(layout, light, poses), classes, policy, faults
         )
 
     def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
         positions, poses = (np.array(x, np.float32) for x in (positions, poses))
-        faults = mission.no_faults(CONFIG) if faults is None else faults
+        faults = no_faults(CONFIG) if faults is None else faults
         return start(positions, poses, np.array(classes), np.int32(policy), faults)
 
     return make

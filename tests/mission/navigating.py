@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig
+from jaxsense.config.scene import ArenaConfig
 
 ARENA = ArenaConfig()
 PERIOD = 0.1  # s

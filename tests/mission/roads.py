@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Config
+from jaxsense.config import Config
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.mission import roadmap
 
 CONFIG = Config()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from teams import CONFIG
 
-from jaxsense.config import CONTROL_PERIOD
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.mission import act
 from jaxsense.mission.state import (
     ATTEMPTS,

@@ -11,13 +11,14 @@ from teams import CONFIG, LATENT, POSES, POSITIONS, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.config import CommunicationConfig
+from jaxsense.config.mission import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.mission import maps
+from jaxsense.mission.begin import start
 from jaxsense.mission.maps import MOST_LOOKS, Contents, Evidence, OwnMap, SharedMap
-from jaxsense.mission.rollout import _repeat_messages
+from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
 from jaxsense.vae.filter import Filter
@@ -62,7 +63,7 @@ def own_arena(own_team, own_models, arena_of):
 
     def make(positions, poses, policy=LATENT):
         state = arena_of(positions, poses, classes=(2, 0, 1), policy=policy)
-        return mission.start(
+        return start(
             *(own_team, own_models, state.scene, state.classes, state.policy, state.faults),
             paths=state.roadmap,
         )
@@ -205,7 +206,7 @@ def test_without_losses_and_delay_missions_are_those_of_a_shared_map(team, own_m
         @jax.jit
         def run(keys):
             begin = lambda key: mission.reset(key, changed, own_models, LATENT)  # noqa: E731
-            return mission.rollout_batch(keys, changed, own_models, jax.vmap(begin)(keys), 150)
+            return rollout_batch(keys, changed, own_models, jax.vmap(begin)(keys), 150)
 
         return as_numpy(run(jax.random.split(jax.random.key(1), 6)))
 

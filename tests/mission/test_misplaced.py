@@ -9,7 +9,7 @@ import pytest
 from teams import CONFIG, POSES, POSITIONS, with_config
 
 from jaxsense import mission
-from jaxsense.config import LocalisationConfig, Search
+from jaxsense.config.mission import LocalisationConfig, Search
 from jaxsense.mission import act, decide
 from jaxsense.mission.rollout import _drift
 from jaxsense.mission.state import DRIVING, FACING

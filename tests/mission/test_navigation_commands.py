@@ -8,7 +8,7 @@ import pytest
 from navigating import ARENA
 
 from jaxsense import sim
-from jaxsense.config import SHAPES
+from jaxsense.config.scene import SHAPES
 from jaxsense.mission import navigation
 from jaxsense.sim import amiro
 

@@ -10,6 +10,8 @@ from teams import CONFIG, POLICIES, with_class_beliefs
 
 from jaxsense import mission
 from jaxsense.core.types import Belief
+from jaxsense.mission import outcome
+from jaxsense.mission.outcome import REASONS, reason
 from jaxsense.mission.state import DRIVING, ENDED, FAILED
 
 POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
@@ -43,7 +45,7 @@ def test_figures_as_worked_by_hand(team, known, ended):
     )
     state = replace(ended, belief=Belief(mean, std), robots=robots, contacts=jnp.int32(4))
     state = replace(state, times_seen=jnp.array([[1, 0]] * 3))
-    measure = jax.jit(lambda state: mission.measure(team, known, state))
+    measure = jax.jit(lambda state: outcome.measure(team, known, state))
     found = measure(state)
     np.testing.assert_array_equal(found["is_right"], [True, True, False])
     np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
@@ -82,7 +84,7 @@ def one(flag_of, robot, poi):
     ],
 )
 def test_a_mission_says_how_it_ended(ended, expected, change):
-    assert mission.REASONS[mission.reason(change(ended))] == expected
+    assert REASONS[reason(change(ended))] == expected
 
 
 def _phases(state, *phases):

@@ -11,6 +11,7 @@ from teams import CONFIG, POLICIES, decide_alone
 from jaxsense import evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
+from jaxsense.mission.outcome import require_playable
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import output, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -99,7 +100,7 @@ def playing(*names):
 )
 def test_the_name_of_a_policy_is_a_word_that_is_free(name, reason):
     with pytest.raises(ConfigError, match=rf"^policies = {name!r}: {reason}"):
-        mission.require_playable(CONFIG, {name: close})
+        require_playable(CONFIG, {name: close})
 
 
 RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]

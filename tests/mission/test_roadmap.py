@@ -22,7 +22,9 @@ from roads import (
 from scipy.sparse import csgraph
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Config, NavigationConfig
+from jaxsense.config import Config
+from jaxsense.config.mission import NavigationConfig
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.mission import roadmap
 
 WALLED_IN = Config(

@@ -9,9 +9,11 @@ import pytest
 from teams import CONFIG
 
 from jaxsense import mission
-from jaxsense.config import CONTROL_PERIOD
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.mission import act
 from jaxsense.mission.act import where_due
+from jaxsense.mission.outcome import REASONS, reason
+from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import ENDED, FAILED, Faults
 from jaxsense.sim import amiro
 
@@ -45,7 +47,7 @@ def team(team):
 def go_on(team, models):
     """One control period after another, in arenas side by side."""
 
-    return jax.jit(lambda keys, states: mission.rollout_batch(keys, team, models, states, CHUNK))
+    return jax.jit(lambda keys, states: rollout_batch(keys, team, models, states, CHUNK))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +95,7 @@ def test_a_batch_is_its_members_one_by_one(team, models, played):
     # Thirteen, more than decide or scan at once.
     states = played[1]
     keys = jax.random.split(jax.random.key(9), len(states.steps))
-    together = jax.jit(lambda k, s: mission.rollout_batch(k, team, models, s, CHUNK))
+    together = jax.jit(lambda k, s: rollout_batch(k, team, models, s, CHUNK))
     alone = jax.jit(lambda k, s: mission.rollout(k, team, models, s, CHUNK))
     ends, records = together(keys, states)
     assert np.sum(records.scanned) > 10
@@ -111,7 +113,7 @@ def healthy(played):
 
 
 def reasons(state):
-    return [mission.REASONS[code] for code in jax.vmap(mission.reason)(state)]
+    return [REASONS[code] for code in jax.vmap(reason)(state)]
 
 
 def test_the_smallest_clearance_is_that_of_the_records_until_the_end(healthy):

@@ -19,7 +19,7 @@ def last_first(key, models, known):
 
 
 def measured(right, looks, time):
-    """Metrics of four missions with two PoIs, as `mission.measure` has them."""
+    """Metrics of four missions with two PoIs, as `measure` has them."""
     one = np.ones(4)
     return {
         "is_right": np.array(right, bool),

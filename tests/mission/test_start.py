@@ -9,7 +9,8 @@ import pytest
 
 import jaxsense
 from jaxsense import mission, sim
-from jaxsense.config import ArenaConfig, Config
+from jaxsense.config import Config
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.core.types import Belief
 from jaxsense.mission import begin, roadmap
 

@@ -19,7 +19,9 @@ from teams import (
 import jaxsense
 from jaxsense import mission
 from jaxsense.mission import act
-from jaxsense.mission.state import DRIVING, FACING
+from jaxsense.mission.begin import start
+from jaxsense.mission.state import DRIVING, FACING, no_faults
+from jaxsense.sim.light import Light
 
 TEAM = replace(CONFIG, robots=("camera", "camera", "lidar"))
 FIRST, SECOND, LIDAR = 0, 1, 2
@@ -35,14 +37,14 @@ def many():
 
 @pytest.fixture(scope="module")
 def start_of(many, models):
-    begin = jax.jit(lambda *given: mission.start(many, models, *given))
+    begin = jax.jit(lambda *given: start(many, models, *given))
 
     def make(poses=POSES, policy=NAIVE, faults=None, classes=(2, 0, 1)):
         classes = jnp.array(classes)
         layout = jaxsense.sim.make_layout(TEAM.arena, jnp.array(POSITIONS), jnp.zeros(3), classes)
-        light = jaxsense.sim.Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
+        light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
         scene = jaxsense.sim.Scene(layout, light, jnp.array(poses, jnp.float32))
-        faults = mission.no_faults(TEAM) if faults is None else faults
+        faults = no_faults(TEAM) if faults is None else faults
         return begin(scene, classes, jnp.int32(policy), faults)
 
     return make

@@ -9,9 +9,10 @@ import pytest
 
 from jaxsense import recorded, sim
 from jaxsense.config import PRESETS
+from jaxsense.sim import viewpoints
 
 CONFIG = replace(PRESETS["smoke"], arena=replace(PRESETS["smoke"].arena, side=4.0))
-LIDAR = sim.sensors.make(CONFIG)[1]
+LIDAR = sim.make_world(CONFIG).sensors[1]
 PLACES = np.array([[1.0, 0.0], [0.0, 0.8], [-0.5, 0.0]])
 POSES = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.2], [0.0, 0.0, -3.0]])
 EMPTY = np.full((3, 683), 5.0)
@@ -37,7 +38,9 @@ def test_bearing_and_distance_follow_from_poses(write):
     # Straight ahead; at 90 degrees from a robot at 1.2 rad; behind, 180 degrees from -3 rad.
     np.testing.assert_allclose(bearing, [0.0, np.pi / 2 - 1.2, 3.0 - np.pi], atol=1e-6)
     np.testing.assert_allclose(distance, [1.0, 0.8, 0.5], rtol=1e-6)
-    expected = [sim.bearing(jnp.array(p), jnp.array(q)) for p, q in zip(POSES, PLACES, strict=True)]
+    expected = [
+        viewpoints.bearing(jnp.array(p), jnp.array(q)) for p, q in zip(POSES, PLACES, strict=True)
+    ]
     np.testing.assert_allclose(bearing, expected, atol=1e-6)
 
 

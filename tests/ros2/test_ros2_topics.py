@@ -81,7 +81,7 @@ def test_a_team_of_nodes_finds_out_what_stands_where(ros2, tmp_path):
     def scans(key, poses):
         data = sim.place(world.arena, scene.layout, poses)
         return [
-            sim.sensors.scan(
+            sim.scan(
                 key, sensor, world.arena, data, scene.layout, scene.light, i, sensor.directions
             )
             for i, sensor in enumerate(world.sensors)

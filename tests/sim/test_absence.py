@@ -11,6 +11,7 @@ from jaxsense import sim
 from jaxsense.config import Config
 from jaxsense.sim import absence, windows, world
 from jaxsense.sim import arena as arenas
+from jaxsense.sim.viewpoints import bearing
 
 CONFIG = Config()
 NUM_LOOKS = 400
@@ -31,7 +32,7 @@ def looks():
             positions=scene.layout.position,
             poses=scene.poses,
             twin=jnp.array(absence.outside(CONFIG.arena)),
-            bearing=sim.bearing(pose, place),
+            bearing=bearing(pose, place),
             distance=jnp.linalg.norm(place - pose[:2]),
         )
         arena, sensors = CONFIG.arena, simulation.sensors

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig
+from jaxsense.config.scene import ArenaConfig
+from jaxsense.sim import arena as arenas
 
 STEPS = 200
 TIMESTEP = 0.01  # s
@@ -15,7 +16,7 @@ FREE_TOLERANCE = 2e-5  # m, rad, m/s and rad/s, over 2 s of float32 against floa
 def driver(arena):
     def run(layout, poses, wheel_speeds):
         def step(data, speeds):
-            data = sim.drive(arena, data, speeds)
+            data = arenas.drive(arena, data, speeds)
             return data, (data.qpos, data.qvel, data.geom_xpos, data.geom_xmat)
 
         start = sim.place(arena, layout, poses)
@@ -53,7 +54,7 @@ def drive_freely(arena):
 
 @pytest.fixture(scope="module")
 def contact_arena():
-    return sim.build(ArenaConfig(), (False, True), contacts=True)
+    return arenas.build(ArenaConfig(), (False, True), contacts=True)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +81,7 @@ def test_place_shows_each_poi_once_in_its_shape_and_turns_it(arena, place):
     np.testing.assert_allclose(shown["poi2_cylinder"], [0.9, 1.1, 0.1], atol=1e-6)
     first_side = data.geom_xmat[arena.mj_model.geom("poi1_cylinder").id][:, 0]
     np.testing.assert_allclose(first_side, [np.cos(0.5), np.sin(0.5), 0.0], atol=1e-6)
-    np.testing.assert_allclose(sim.robot_poses(data)[1], [1.0, -1.0, -2.0])
+    np.testing.assert_allclose(arenas.robot_poses(data)[1], [1.0, -1.0, -2.0])
     # The LiDAR's box is 0.094 to 0.164 m above the floor: its beams at 0.152 leave from within.
     lidar = data.geom_xpos[arena.mj_model.geom("robot1_lidar").id]
     np.testing.assert_allclose(lidar, [1.0, -1.0, 0.129], atol=1e-6)

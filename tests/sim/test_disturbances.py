@@ -9,7 +9,8 @@ import pytest
 import scipy.stats
 
 from jaxsense import sim
-from jaxsense.config import CameraConfig, LidarConfig, ViewpointConfig
+from jaxsense.config import CameraConfig, LidarConfig
+from jaxsense.config.scene import ViewpointConfig
 from jaxsense.sim import light as lights
 from jaxsense.sim import sensors, windows, world
 from jaxsense.sim.light import Light, random_conditions

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import PRESETS, LocalisationConfig
+from jaxsense.config import PRESETS
+from jaxsense.config.mission import LocalisationConfig
 from jaxsense.sim import sensors
 from jaxsense.sim.domain import make_domain
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense import sim
-from jaxsense.sim.light import Conditions, random_conditions
+from jaxsense.sim.light import Conditions, random_conditions, random_light
 
 NUMBER = 20_000
 KEYS = jax.random.split(jax.random.key(0), NUMBER)
@@ -32,7 +31,7 @@ def values(conditions):
 
 
 def test_random_light_is_a_unit_vector_from_20_to_70_degrees():
-    light = jax.jit(jax.vmap(sim.random_light))(jax.random.split(jax.random.key(0), 500))
+    light = jax.jit(jax.vmap(random_light))(jax.random.split(jax.random.key(0), 500))
     np.testing.assert_allclose(np.linalg.norm(light.direction, axis=-1), 1.0, atol=1e-6)
     height = np.degrees(np.arcsin(light.direction[:, 2]))
     assert 20 <= height.min() < 22

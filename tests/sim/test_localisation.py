@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import PRESETS
-from jaxsense.config import LocalisationConfig
+from jaxsense.config.mission import LocalisationConfig
 from jaxsense.sim import localisation, world
 
 

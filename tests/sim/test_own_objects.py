@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import ArenaConfig, Attribute, Shape
+from jaxsense.config import Attribute, Shape
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.sim import sensors, windows
+from jaxsense.sim.arena import build
+from jaxsense.sim.light import Light
 
-LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
+LIGHT = Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
 CONFIG = ArenaConfig(
     colours={"orange": (0.9, 0.4, 0.05), "black": (0.0, 0.0, 0.0)},
     shapes={"slab": Shape("box", (1.0, 0.6)), "post": Shape("cylinder", (0.5, 0.5))},
@@ -29,7 +32,7 @@ cross_section = jax.jit(sim.cross_section, static_argnames=("arena", "robot"))
 @pytest.fixture(scope="module")
 def view():
     """An arena of them, and its state with a robot before the slab and one in a corner."""
-    arena = sim.build(CONFIG, (False, True), contacts=True)
+    arena = build(CONFIG, (False, True), contacts=True)
     poses = jnp.array([[-0.5, 0.0, 0.0], [-1.3, -1.3, 0.0]])
     return arena, jax.jit(sim.place, static_argnums=0)(arena, LAYOUT, poses)
 

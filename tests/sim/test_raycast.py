@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import LIDAR_HEIGHT, ArenaConfig
+from jaxsense.config.scene import LIDAR_HEIGHT, ArenaConfig
 from jaxsense.sim import amiro, raycast
 
 DISTANCE_TOLERANCE = 1e-4  # m

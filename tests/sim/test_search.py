@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import PRESETS
-from jaxsense.config import Search
+from jaxsense.config.mission import Search
 from jaxsense.sim import search, sensors, windows
 
 CAMERA, LIDAR = sensors.make(PRESETS["default"])

@@ -6,10 +6,11 @@ import pytest
 from jaxsense import sim
 from jaxsense.config import CameraConfig, Config, LidarConfig
 from jaxsense.sim import sensors, windows
+from jaxsense.sim.light import Light
 from jaxsense.sim.raycast import Hit
 
 # Towards +x and up by an elevation whose cosine is 0.8.
-LIGHT = sim.Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
+LIGHT = Light(jnp.array([0.8, 0.0, 0.6]), diffuse=jnp.float32(0.5), ambient=jnp.float32(0.25))
 # Robots 0 and 1 look at the cylinder in the origin from 0.5 m before and behind it.
 FACE_TO_FACE = jnp.array([[-0.5, 0.0, 0.0], [0.5, 0.0, np.pi]])
 GREEN = np.array([0.1, 0.7, 0.1])

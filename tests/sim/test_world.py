@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from jaxsense import sim
-from jaxsense.config import CLEARANCE, ArenaConfig, Config, ViewpointConfig
+from jaxsense.config import Config
+from jaxsense.config.scene import CLEARANCE, ArenaConfig, ViewpointConfig
 from jaxsense.sim import viewpoints
 
 CLASSES = jnp.array([0, 1, 2])  # green cylinder, red cylinder, red cube

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from jaxsense import mission
-from jaxsense.config import PRESETS, ArenaConfig, Config, EvaluationConfig, JmvaeConfig
+from jaxsense.config import PRESETS, Config, JmvaeConfig
+from jaxsense.config.learning import EvaluationConfig
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.summary import make
 from jaxsense.training.comparison import permutations
 

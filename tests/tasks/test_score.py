@@ -11,6 +11,7 @@ import jaxsense
 from jaxsense import dqn, tasks
 from jaxsense.config import ConfigError
 from jaxsense.tasks import registry
+from jaxsense.tasks.score import estimate
 from jaxsense.tasks.task import MapTask
 
 NAME = "map-v0"
@@ -31,7 +32,7 @@ def of_uniform():
 
 def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
     assert of_uniform.returns.shape == (10,)
-    known = tasks.estimate(of_uniform.references["random"])
+    known = estimate(of_uniform.references["random"])
     assert known.low < of_uniform.mean_return.value < known.high
     assert of_uniform.has_optimum
     assert of_uniform.best == "optimal"
@@ -104,10 +105,10 @@ def test_a_policy_on_the_host_may_use_jax_and_write_into_its_observations(librar
 
 def test_the_interval_is_of_the_interquartile_mean():
     # The middle half of 1, 2, 3, 100: 2.5.
-    found = tasks.estimate(np.array([3.0, 100.0, 1.0, 2.0]))
+    found = estimate(np.array([3.0, 100.0, 1.0, 2.0]))
     assert found.value == 2.5
     assert 1 <= found.low < 2.5 < found.high <= 100
-    assert tasks.estimate(np.array([4.0])) == tasks.Estimate(4.0, 4.0, 4.0)
+    assert estimate(np.array([4.0])) == tasks.Estimate(4.0, 4.0, 4.0)
 
 
 def test_actions_from_the_host_stay_integers():

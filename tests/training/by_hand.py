@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.config import Config, DqnConfig, EvaluationConfig, JmvaeConfig, MdpConfig
+from jaxsense.config import Config, DqnConfig, JmvaeConfig, MdpConfig
+from jaxsense.config.learning import EvaluationConfig
 from jaxsense.core.types import Belief
 from jaxsense.models import make_in_place
 from jaxsense.training.detections import Detections

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from by_hand import CONFIG, EXACT, KEY, detections, in_place
 
-from jaxsense.config import EvaluationConfig
+from jaxsense.config.learning import EvaluationConfig
 from jaxsense.dqn import optimum, policies
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.training import comparison

@@ -10,7 +10,8 @@ import pytest
 from tiny import inputs_of, learn_by_stages
 
 from jaxsense import PRESETS, Config, looks, training
-from jaxsense.config import DetectorConfig, FilterConfig, JmvaeConfig
+from jaxsense.config import DetectorConfig, JmvaeConfig
+from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
 from jaxsense.models import make_shape
 from jaxsense.training import scans

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import training
-from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig, MissionConfig
+from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
+from jaxsense.config.mission import MissionConfig
 from jaxsense.sim.world import make_world
 from jaxsense.training.stage import is_finite, scan
 

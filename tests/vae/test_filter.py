@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.config import FilterConfig
+from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.vae import bayes, filter, fusion
