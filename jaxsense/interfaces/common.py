@@ -1,7 +1,6 @@
 """What the interfaces share: imports of extras, spaces, starts, and robots of a team."""
 
 import contextlib
-import os
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -11,20 +10,17 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import Config
 from jaxsense.config.whole import names_of_robots
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.tasks import make
 from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
 from jaxsense.tasks.task import TeamTask
 
 T = TypeVar("T")
-
-_processes: set[int] = set()  # in which environments were made: this one and those it forked from
 
 
 @contextlib.contextmanager
@@ -36,18 +32,6 @@ def extra(name: str) -> Iterator[None]:
         package = (error.name or name).partition(".")[0]
         message = f"{package} is not installed: pip install 'jaxsense[{name}]'"
         raise ModuleNotFoundError(message, name=package) from None
-
-
-def enter_process() -> None:
-    """Notes that an environment was made in this process."""
-    _processes.add(os.getpid())
-
-
-def require_own_process() -> None:
-    """Raises `RuntimeError` in a fork of a process with environments, where JAX hangs."""
-    if _processes - {os.getpid()}:
-        advice = "start processes with spawn, as vector_kwargs={'context': 'spawn'} does"
-        raise RuntimeError(f"this process was forked from one that uses JAX: {advice}")
 
 
 def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
@@ -70,8 +54,8 @@ def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
     checks.require_number("number of starts", number)
     # A start is the same for all sensors.
     played = OneAgent(mdp, 0) if isinstance(mdp, MapMdp) else mdp
-    reset = jax.vmap(lambda key, played: played.reset(key)[1], (0, None))
-    return jax.jit(lambda key, played: reset(jax.random.split(key, number), played))(key, played)
+    reset = jax.jit(jax.vmap(lambda key, played: played.reset(key)[1], (0, None)))
+    return reset(jax.random.split(key, number), played)
 
 
 def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, " S"], PyTree]:
@@ -97,14 +81,12 @@ class Robots:
       sensors: `[R]` int32 index of each robot's sensor.
       scaling: of observations; None for those of `team_mdp.observation`.
       names: of the robots.
-      modality: names of their sensors.
     """
 
     mdp: TeamMdp
     sensors: jax.Array
     scaling: Scaling | None
     names: tuple[str, ...] = struct.field(pytree_node=False)
-    modality: tuple[str, ...] = struct.field(pytree_node=False)
 
     @property
     def observation_size(self) -> int:
@@ -164,28 +146,16 @@ class Robots:
         return after, found, seconds
 
 
-def robots_of(mdp: TeamMdp | TeamTask | str, config: Config | None = None) -> Robots:
-    """Robots of a task, or of its name; or of the MDP of a team, with the settings that name them.
-
-    Raises:
-      ConfigError: if there is no such task, or it is not of a team.
-      ValueError: if the MDP is not that of a team with the sensors of the settings.
-    """
-    played = make(mdp) if isinstance(mdp, str) else mdp
-    if isinstance(mdp, str) and not isinstance(played, TeamTask):
-        raise ConfigError("name", mdp, "must be a task of a team, such as team-v0")
-    if isinstance(played, TeamTask):
-        if config is not None:
-            raise ValueError("config: must be None with a task, which has its robots")
-        modality = tuple(played.mdp.modalities[m] for m in played.robots.tolist())
-        names = names_of_robots(modality)
-        return Robots(played.mdp, played.robots, played.scaling, names, modality)
-    if config is None or played.modalities != config.modalities:
-        sensors = None if config is None else config.modalities
-        made = f"must be a TeamMdp with {sensors}, from jaxsense.make_mdp with dqn.task = 'team'"
-        raise ValueError(f"mdp = {type(played).__name__} with {played.modalities}: {made}")
-    sensors = jnp.array(config.modality_of_robot, jnp.int32)
-    return Robots(played, sensors, None, config.robot_names, config.carried)  # pyright: ignore
+def robots_of(mdp: TeamMdp | TeamTask, config: Config | None = None) -> Robots:
+    """Robots of a task; or of the MDP of a team, with the settings that name them."""
+    if isinstance(mdp, TeamTask) and config is None:
+        carried = tuple(mdp.modalities[m] for m in mdp.robots.tolist())
+        return Robots(mdp.mdp, mdp.robots, mdp.scaling, names_of_robots(carried))
+    if isinstance(mdp, TeamMdp) and config and mdp.modalities == config.modalities:
+        sensors = jnp.array(config.modality_of_robot, jnp.int32)
+        return Robots(mdp, sensors, None, config.robot_names)
+    expected = "must be a task of a team alone, or a TeamMdp and the settings that it is made with"
+    raise ValueError(f"mdp = {type(mdp).__name__}: {expected}")
 
 
 def spaces_of(spaces: Any, played: Environment | Robots) -> tuple[Any, Any]:

@@ -57,7 +57,6 @@ class MapVectorEnv(VectorEnv):
           render_mode: `rgb_array`, so that `render` draws the maps; only with a task.
         """
         self._played, self._starts = common.environment(mdp, modality), starts
-        common.enter_process()
         checks.require_number("num_envs", num_envs)
         modes = ["rgb_array"] if isinstance(self._played, Task) else []
         if render_mode not in (None, *modes):
@@ -71,13 +70,11 @@ class MapVectorEnv(VectorEnv):
         self._key, self._states = jax.random.key(0), None
         self._mask = np.ones((num_envs, self._played.num_actions), np.int8)
         self._ended = np.zeros(num_envs, bool)
-        self._actions: list[list[int]] = [[] for _ in range(num_envs)]  # to draw
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Starts new episodes; `reset_mask` in the options, `[E]` bool, restarts only some."""
-        common.require_own_process()
         super().reset(seed=seed)
         if seed is not None or self._states is None:
             self._key = jax.random.key(int(self.np_random.integers(2**32)))
@@ -103,23 +100,18 @@ class MapVectorEnv(VectorEnv):
             raise error.ResetNeeded("step before reset")
         if mode is AutoresetMode.DISABLED and ended.any():
             raise error.ResetNeeded(f"environments {np.flatnonzero(ended)} have ended")
-        is_whole = np.issubdtype(actions.dtype, np.integer)
-        if not (is_whole and self.action_space.contains(actions)):
+        if actions.dtype.kind not in "iu" or not self.action_space.contains(actions):
             raise ValueError(f"actions = {actions!r}: must be integers in {self.action_space}")
         self._key, self._states, found, mask = _step(
             self._key, self._played, self._states, actions.astype(np.int32)
         )
         self._mask = np.array(mask, np.int8)
-        for before, action in zip(self._actions, actions.tolist(), strict=True):
-            before.append(action)
         observations, rewards = np.array(found.observation), np.array(found.reward, np.float64)
         terminations, truncations = np.array(found.terminated), np.array(found.truncated)
         final = {}
         if mode is AutoresetMode.NEXT_STEP and ended.any():
             observations = self._restarted(ended)
-            rewards[ended] = 0.0
-            terminations &= ~ended
-            truncations &= ~ended
+            rewards[ended], terminations[ended], truncations[ended] = 0.0, False, False
         self._ended = terminations | truncations
         if mode is AutoresetMode.SAME_STEP and self._ended.any():
             final = _final(observations, self._mask, self._ended)
@@ -138,7 +130,7 @@ class MapVectorEnv(VectorEnv):
             raise error.ResetNeeded("render before reset")
         from jaxsense.show.task_plots import frames  # noqa: PLC0415  (matplotlib)
 
-        return frames(self._played, self._states, self._actions)  # pyright: ignore
+        return frames(self._played, self._states)  # pyright: ignore
 
     def _restarted(self, mask: np.ndarray) -> np.ndarray:
         """Observations after new starts where the mask is True."""
@@ -146,8 +138,6 @@ class MapVectorEnv(VectorEnv):
             self._key, self._played, self._starts, self._states, mask
         )
         self._ended = self._ended & ~mask
-        for i in np.flatnonzero(mask):
-            self._actions[i] = []
         self._mask = np.array(found, np.int8)
         return np.array(observations)
 

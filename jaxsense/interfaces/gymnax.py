@@ -110,23 +110,16 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         return ~state.terminated & (state.time >= params.max_steps_in_episode)
 
     @property
-    def name(self) -> str:
-        """Name of the task; of a map MDP `jaxsense-Map`."""
-        return getattr(self.played, "name", "jaxsense-Map")
-
-    @property
     def num_actions(self) -> int:
         """A look at each PoI, and NOP."""
         return self.played.num_actions
 
     def action_space(self, params: MapEnvParams | None = None) -> spaces.Discrete:
         """Space of the actions."""
-        del params
         return common.spaces_of(spaces, self.played)[1]
 
     def observation_space(self, params: MapEnvParams | None = None) -> spaces.Box:
         """Space of the observations."""
-        del params
         return common.spaces_of(spaces, self.played)[0]
 
 

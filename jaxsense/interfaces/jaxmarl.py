@@ -10,6 +10,7 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
+from jaxsense import tasks
 from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
@@ -47,11 +48,11 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     the same for all, is the duration of the step. The methods are jaxmarl's.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask | str, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
         """Makes the environment.
 
         Args:
-          mdp: a task of a team from `jaxsense.make`, or its name; or the MDP of a team, see
+          mdp: a task of a team from `jaxsense.make`; or the MDP of a team, see
             `jaxsense.make_mdp`.
           config: the settings, which name the robots; only with an MDP.
         """
@@ -95,20 +96,15 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         return self.robots.named(self.robots.action_mask(state.team))
 
     @property
-    def name(self) -> str:
-        """Name of the environment."""
-        return "jaxsense-Team"
-
-    @property
     def agent_classes(self) -> dict[str, list[str]]:
         """Robots of each modality."""
         classes: dict[str, list[str]] = {}
-        for agent, modality in zip(self.agents, self.robots.modality, strict=True):
-            classes.setdefault(modality, []).append(agent)
+        for agent, sensor in zip(self.agents, self.robots.sensors.tolist(), strict=True):
+            classes.setdefault(self.robots.mdp.modalities[sensor], []).append(agent)
         return classes
 
 
 @functools.cache  # jaxmarl makes environments static, see `TeamEnv`
 def make(name: str) -> TeamEnv:
     """The environment of a task of a team, see `jaxsense.make`; the same one in every call."""
-    return TeamEnv(name)
+    return TeamEnv(tasks.make(name))

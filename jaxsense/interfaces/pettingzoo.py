@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxsense import tasks
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
@@ -34,16 +35,15 @@ class TeamAECEnv(AECEnv):
     actions that the robot has.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask | str, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
         """Makes the environment; `reset` must be called before the first step.
 
         Args:
-          mdp: a task of a team from `jaxsense.make`, or its name; or the MDP of a team, see
+          mdp: a task of a team from `jaxsense.make`; or the MDP of a team, see
             `jaxsense.make_mdp`.
           config: the settings, which name the robots; only with an MDP.
         """
         self._robots = common.robots_of(mdp, config)
-        common.enter_process()
         self.metadata = {"name": "jaxsense_team_v0", "render_modes": []}
         self.render_mode = None
         self.possible_agents = list(self._robots.names)
@@ -64,7 +64,6 @@ class TeamAECEnv(AECEnv):
     def reset(self, seed: int | None = None, options: dict[str, object] | None = None) -> None:
         """Starts an episode; no options are read."""
         del options
-        common.require_own_process()
         if seed is not None or self._key is None:
             (word,) = np.random.SeedSequence(seed).generate_state(1)
             self._key = jax.random.key(int(word))
@@ -139,19 +138,19 @@ class TeamParallelEnv(conversions.turn_based_aec_to_parallel_wrapper):
     alone, and `active_agent` in the infos names it.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask | str, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
         """Makes the environment, see `TeamAECEnv`."""
         super().__init__(TeamAECEnv(mdp, config))
 
 
 def make(name: str) -> TeamAECEnv:
     """The `AECEnv` of a task of a team, see `jaxsense.make`."""
-    return TeamAECEnv(name)
+    return TeamAECEnv(tasks.make(name))
 
 
 def make_parallel(name: str) -> TeamParallelEnv:
     """The `ParallelEnv` of a task of a team, see `jaxsense.make`."""
-    return TeamParallelEnv(name)
+    return TeamParallelEnv(tasks.make(name))
 
 
 @jax.jit

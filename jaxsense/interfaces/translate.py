@@ -5,7 +5,7 @@ needs no line here, unless it uses a primitive that `_OPERATORS` lacks.
 """
 
 import ast
-import functools
+import dataclasses
 import hashlib
 import itertools
 from collections import ChainMap
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 from jax.extend import core
+from jax.interpreters import partial_eval
 from jax.lax import GatherScatterMode, RoundingMethod
 from jaxtyping import PyTree
 from onnx import checker, helper, numpy_helper
@@ -30,7 +31,10 @@ Equation = Any
 Size = Any
 """The size of an axis: a number, or an expression of JAX such as `pois + 1`."""
 
+_ARITHMETIC = {ast.Add: "Add", ast.Sub: "Sub", ast.Mult: "Mul", ast.Pow: "Pow"}
 
+
+@dataclasses.dataclass
 class Graph:
     """A graph of operators so far; arrays are known by their names.
 
@@ -42,15 +46,11 @@ class Graph:
       nodes: operators, in their order.
     """
 
-    def __init__(
-        self,
-        constants: dict[str, np.ndarray],
-        sizes: dict[str, str],
-        names: Iterator[str],
-        known: ChainMap[Any, str],
-    ):
-        self.constants, self.sizes, self.names, self.known = constants, sizes, names, known
-        self.nodes: list[onnx.NodeProto] = []
+    constants: dict[str, np.ndarray]
+    sizes: dict[str, str]
+    names: Iterator[str]
+    known: ChainMap[Any, str] = dataclasses.field(default_factory=ChainMap)
+    nodes: list[onnx.NodeProto] = dataclasses.field(default_factory=list)
 
     def constant(self, value: Any) -> str:
         """The name of an array, which says what it holds."""
@@ -90,19 +90,14 @@ class Graph:
         """The size of an axis: a number, or the name of one; a polynomial such as `2*pois + 1`."""
 
         def read(tree: ast.expr) -> Any:
-            operators: dict[type, str] = {
-                ast.Add: "Add", ast.Sub: "Sub", ast.Mult: "Mul", ast.Pow: "Pow", ast.USub: "Neg"
-            }  # fmt: skip
             match tree:
                 case ast.Constant(value=value):
                     return value
                 case ast.Name(id=name):
                     return self.sizes[name]
-                case ast.UnaryOp(op=op, operand=operand) if type(op) in operators:
-                    return self.op(operators[type(op)], read(operand))
-                case ast.BinOp(left=left, op=op, right=right) if type(op) in operators:
-                    return self.op(operators[type(op)], read(left), read(right))
-            raise NotImplementedError(f"the size {size} has no ONNX translation")
+                case ast.BinOp(left=left, op=op, right=right) if type(op) in _ARITHMETIC:
+                    return self.op(_ARITHMETIC[type(op)], read(left), read(right))
+            return _require(False, f"the size {size}")
 
         return read(ast.parse(str(size).replace("^", "**"), mode="eval").body)
 
@@ -155,9 +150,8 @@ class Graph:
 
         for equation in jaxpr.eqns:
             kind, given = equation.primitive.name, map(read, equation.invars)
-            operator = _OPERATORS.get(kind)
-            if operator is None:
-                raise NotImplementedError(f"the primitive {kind} has no ONNX translation")
+            _require(kind in _OPERATORS, f"the primitive {kind}")
+            operator = _OPERATORS[kind]
             is_one = isinstance(operator, str)
             found = self.op(operator, *given) if is_one else operator(self, equation, *given)
             outputs = [found] if isinstance(found, str) else found
@@ -168,7 +162,7 @@ class Graph:
         self, inputs: Mapping[str, Any], body: Callable[["Graph"], Sequence[str]]
     ) -> onnx.GraphProto:
         """A graph within this one, of which each output has a name of its own."""
-        inner = Graph(self.constants, self.sizes, self.names, self.known.new_child())
+        inner = dataclasses.replace(self, known=self.known.new_child(), nodes=[])
         outputs = [inner.ops("Identity", 1, x)[0] for x in body(inner)]
         untyped = [helper.make_empty_tensor_value_info(x) for x in outputs]
         given = [_info(*each) for each in inputs.items()]
@@ -200,6 +194,11 @@ def _kind(dtype: Any) -> int:
     return helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
 
 
+def _require(is_translated: bool, what: str) -> None:
+    if not is_translated:
+        raise NotImplementedError(f"{what} has no ONNX translation")
+
+
 # Each of these builds the operators of an equation of JAX, from the names of its inputs.
 
 
@@ -208,8 +207,9 @@ def _inlined(graph: Graph, e: Equation, *given: str) -> list[str]:
 
 
 def _round(graph: Graph, e: Equation, x: str) -> str:
-    if e.params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
-        raise NotImplementedError("rounding away from zero has no ONNX translation")
+    _require(
+        e.params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN, "rounding away from zero"
+    )
     return graph.op("Round", x)
 
 
@@ -226,8 +226,7 @@ def _atan2(graph: Graph, e: Equation, y: str, x: str) -> str:
 
 
 def _select(graph: Graph, e: Equation, which: str, *cases: str) -> str:
-    if len(cases) != 2 or e.invars[0].aval.dtype.kind != "b":
-        raise NotImplementedError("a choice among more than two has no ONNX translation")
+    _require(e.invars[0].aval.dtype.kind == "b", "a choice among more than two")
     return graph.where(which, cases[1], cases[0], e.invars[1].aval.dtype)
 
 
@@ -298,8 +297,7 @@ def _product(graph: Graph, e: Equation, x: str, y: str) -> str:
 
 
 def _gather(graph: Graph, e: Equation, x: str, indices: str) -> str:
-    if e.params["mode"] == GatherScatterMode.FILL_OR_DROP:
-        raise NotImplementedError("gather that fills has no ONNX translation")
+    _require(e.params["mode"] != GatherScatterMode.FILL_OR_DROP, "gather that fills")
     numbers, sizes = e.params["dimension_numbers"], e.params["slice_sizes"]
     shape, found = e.invars[0].aval.shape, e.outvars[0].aval.shape
     mapped, batched = [*numbers.start_index_map], [*numbers.operand_batching_dims]
@@ -323,9 +321,9 @@ def _scatter(adds: bool) -> Callable[..., str]:
     def scatter(graph: Graph, e: Equation, x: str, indices: str, updates: str) -> str:
         numbers, shape = e.params["dimension_numbers"], e.invars[0].aval.shape
         mapped = [*numbers.scatter_dims_to_operand_dims]
-        is_one = len(mapped) == 1 and [*numbers.inserted_window_dims] == mapped
-        if not is_one or e.invars[1].aval.ndim != 1 or numbers.operand_batching_dims:
-            raise NotImplementedError("scatter of several rows has no ONNX translation")
+        is_row = len(mapped) == 1 and [*numbers.inserted_window_dims] == mapped
+        is_one = e.invars[1].aval.ndim == 1 and not numbers.operand_batching_dims
+        _require(is_row and is_one, "scatter of several rows")
         (axis,) = mapped
         row = graph.cast(indices, np.int64)
         is_row = graph.op("Equal", graph.range(shape[axis]), row)
@@ -345,16 +343,14 @@ def _cond(graph: Graph, e: Equation, index: str, *given: str) -> list[str]:
     branches = e.params["branches"]
     if index in graph.constants:
         return graph.run(branches[int(graph.constants[index])], given)
-    if len(branches) != 2:
-        raise NotImplementedError("a choice among more than two has no ONNX translation")
+    _require(len(branches) == 2, "a choice among more than two")
     no, yes = (graph.within({}, lambda inner, b=b: inner.run(b, given)) for b in branches)
     is_second = graph.cast(index, bool)
     return graph.ops("If", len(e.outvars), is_second, then_branch=yes, else_branch=no)
 
 
 def _scan(graph: Graph, e: Equation, *given: str) -> list[str]:
-    if e.params["reverse"]:
-        raise NotImplementedError("a scan from the end has no ONNX translation")
+    _require(not e.params["reverse"], "a scan from the end")
     inner, before, after = e.params["jaxpr"], e.invars, e.outvars
     # What moves along has one axis more outside; versions of JAX name the numbers otherwise.
     rows = sum(v.aval.ndim > x.ndim for v, x in zip(before, inner.in_avals, strict=True))
@@ -382,7 +378,7 @@ def _while(graph: Graph, e: Equation, *given: str) -> list[str]:
     return graph.loop("", goes_on, given[last:], e, body)
 
 
-_CALLS = "jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"
+_CALLS = "jit", "custom_jvp_call", "custom_vjp_call"
 # Runtimes take `and`, `or` and `not` of bools alone.
 _SAME = (
     "add", "sub", "mul", "div", "max", "min", "pow", "exp", "log", "tanh", "tan", "sqrt", "abs",
@@ -397,7 +393,6 @@ _OPERATORS: dict[str, str | Callable[..., str | list[str]]] = {
     "gt": "Greater",
     "ge": "GreaterOrEqual",
     "eq": "Equal",
-    "copy": "Identity",
     "stop_gradient": "Identity",
     "ne": lambda graph, e, x, y: graph.op("Not", graph.op("Equal", x, y)),
     "rem": lambda graph, e, x, y: graph.op("Mod", x, y, fmod=1),
@@ -469,20 +464,25 @@ def program(
     leaves = jax.tree_util.tree_leaves_with_path(models)
     weights = {jax.tree_util.keystr(p, simple=True, separator="/"): x for p, x in leaves}
     closed, outputs = jax.make_jaxpr(apply, return_shape=True)(models, *inputs.values())
-    graph = Graph(dict(weights), {}, (f"x{n}" for n in itertools.count()), ChainMap())
+    jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(outputs))
+    given = list(itertools.compress([*weights, *inputs], is_read))
+    graph = Graph(
+        {n: weights[n] for n in given if n in weights}, {}, map("x{}".format, itertools.count())
+    )
     for key, array in inputs.items():
         for axis, size in enumerate(array.shape):
             if not isinstance(size, int):
                 graph.sizes[str(size)] = graph.op("Gather", graph.op("Shape", key), axis, axis=0)
-    found = zip(graph.run(closed, [*weights, *inputs]), sorted(outputs), strict=True)
-    nodes = [*graph.nodes, *(helper.make_node("Identity", [x], [y]) for x, y in found)]
-    nodes, read = _read(nodes, {*outputs})
+    found = graph.run(core.ClosedJaxpr(jaxpr, closed.consts), given)
+    named = [
+        helper.make_node("Identity", [x], [y]) for x, y in zip(found, sorted(outputs), strict=True)
+    ]
     whole = helper.make_graph(
-        nodes,
+        [*graph.nodes, *named],
         name.replace("+", "_"),
         [_info(*each) for each in inputs.items()],
         [_info(*each) for each in outputs.items()],
-        [numpy_helper.from_array(x, key) for key, x in graph.constants.items() if key in read],
+        [numpy_helper.from_array(x, key) for key, x in graph.constants.items()],
         doc_string=apply.__doc__,
     )
     opsets = [helper.make_opsetid("", OPSET)]
@@ -491,18 +491,3 @@ def program(
     )
     checker.check_model(model)
     return model.SerializeToString(), outputs
-
-
-def _read(nodes: list[onnx.NodeProto], wanted: set[str]) -> tuple[list[onnx.NodeProto], set[str]]:
-    """The operators that lead to names, and all names that they read."""
-
-    def names_of(node: onnx.NodeProto) -> set[str]:
-        inner = [x for attribute in node.attribute for x in attribute.g.node]
-        return functools.reduce(set.union, map(names_of, inner), {*node.input})
-
-    kept = []
-    for node in reversed(nodes):
-        if not wanted.isdisjoint(node.output):
-            kept.append(node)
-            wanted = wanted | names_of(node)
-    return kept[::-1], wanted

@@ -1,7 +1,5 @@
 """Pictures of states of tasks, while somebody plays them."""
 
-from collections.abc import Sequence
-
 import jax
 import numpy as np
 from jaxtyping import PyTree
@@ -24,14 +22,13 @@ _MARGIN = 0.8  # m, around places
 _AROUND = 0.75  # of how far classes lie apart
 
 
-def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np.ndarray:
+def frame(task: Task, state: MapState | TeamState) -> np.ndarray:
     """What is known in a state, and the truth.
 
     Beliefs are 2-sigma ellipses in the two latent dimensions that show classes, which are numbered,
-    farthest apart. Bars show class probabilities. Beside them stand the true class, the sensors
-    that have looked at a PoI, also before the episode, and how often the episode's `actions` chose
-    it. Of a team, robots are shown where they are, with where they drive; the robot whose turn it
-    is has a black edge.
+    farthest apart. Bars show class probabilities. Beside them stand the true class and the sensors
+    that have looked at a PoI, also before the episode. Of a team, robots are shown where they are,
+    with where they drive; the robot whose turn it is has a black edge.
 
     Returns:
       `[H, W, 3]` uint8 sRGB.
@@ -45,7 +42,7 @@ def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np
     figure = Figure(figsize=(_SIZE * (2 + len(state.teams)), _SIZE), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2 + len(state.teams))
-    title = f"{task.name}, {task.agent}", f"step {len(actions)} of {task.max_steps}"
+    title = f"{task.name}, {task.agent}", f"step {int(state.map.steps)} of {task.max_steps}"
     figure.suptitle(", ".join([*title, *(f"{float(each.seconds):.1f} s" for each in state.teams)]))
     nearest = colours[np.argmax(probabilities, axis=1)]
     _draw_beliefs(axes[0], shown, classes, colours, nearest, pois)
@@ -55,8 +52,7 @@ def frame(task: Task, state: MapState | TeamState, actions: Sequence[int]) -> np
         axes[1].barh(pois, of_class, left=left, color=colour, edgecolor="w")
         left += of_class
     names = [
-        f"PoI {n}: class {truth[n] + 1}\n"
-        + ", ".join([*np.compress(seen[n], task.modalities), f"{actions.count(n)} chosen"])
+        f"PoI {n}: class {truth[n] + 1}\n{', '.join(np.compress(seen[n], task.modalities))}"
         for n in pois
     ]
     axes[1].set_yticks(pois, names, fontsize="small")
@@ -76,11 +72,10 @@ def _read(mdp: MapMdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
     return probabilities, mdp.fusion.classes.mean
 
 
-def frames(task: Task, states: PyTree, actions: Sequence[Sequence[int]]) -> tuple[np.ndarray, ...]:
+def frames(task: Task, states: PyTree) -> tuple[np.ndarray, ...]:
     """Pictures of `[E, ...]` states, see `frame`."""
-    of_host = jax.device_get(states)
-    each = (jax.tree.map(lambda x, i=i: x[i], of_host) for i in range(len(actions)))
-    return tuple(frame(task, state, taken) for state, taken in zip(each, actions, strict=True))
+    leaves, structure = jax.tree.flatten(jax.device_get(states))
+    return tuple(frame(task, structure.unflatten(each)) for each in zip(*leaves, strict=True))
 
 
 def _draw_beliefs(

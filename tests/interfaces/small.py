@@ -3,11 +3,7 @@
 import dataclasses
 import functools
 
-import jax
-import jax.numpy as jnp
-
 import jaxsense
-from jaxsense.dqn import map_mdp
 
 # Of three robots; a price of time that is a sum of powers of 2.
 TEAM = dataclasses.replace(jaxsense.PRESETS["team"], robots=("camera", "camera", "lidar"))
@@ -28,12 +24,3 @@ def team():
     mdp = jaxsense.make("team-v0").mdp
     config = dataclasses.replace(mdp.config, num_pois=(1, 8), second_cost=0.125)
     return dataclasses.replace(mdp, config=config, alone=1.0, max_steps=12)
-
-
-def noiseless():
-    """The map MDP where every look at a class sees the same, and `[1]` start of all episodes."""
-    mdp = small_mdp()
-    mdp = dataclasses.replace(mdp, looks=jax.tree.map(lambda x: x[:, :1], mdp.looks))
-    classes, seen = jnp.array([2, 0, 1]), jnp.array([[0, 0], [0, 1], [1, 0]], bool)
-    start = jax.jit(lambda key: map_mdp.reset(key, mdp, classes, seen))(jax.random.key(5))
-    return mdp, jax.tree.map(lambda x: x[None], start)

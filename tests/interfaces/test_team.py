@@ -35,7 +35,6 @@ def with_limit(robots, number):
 
 def test_the_whole_team_starts_and_is_never_alone(robots):
     assert robots.names == AGENTS
-    assert robots.modality == ("camera", "camera", "lidar")
     one_each = robots_of(small.team(), dataclasses.replace(small.TEAM, robots=None))
     assert one_each.names == ("camera", "lidar")
     keys = jax.random.split(jax.random.key(1), 64)
