@@ -24,7 +24,7 @@ from jax import export
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import Search
 from jaxsense.config.options import Name
-from jaxsense.config.scene import MAX_BEARING, POI_HEIGHT
+from jaxsense.config.scene import MAX_BEARING
 from jaxsense.config.section import check_fields
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
@@ -39,7 +39,6 @@ from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks.pretrained import PREFIX
-from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 PROGRAM = "jaxsense.export"
@@ -54,9 +53,9 @@ _POIS, _ROBOTS, _LOOKS = export.symbolic_shape(
 )
 _FRAME = "in one frame of the map that all robots share"
 _MEANING = {
-    "readings": "of all rays of a scan, in the order and unit of `sensors`; resample other scans",
-    "bearing": "of the PoI in the sensor's frame (x ahead, y left), in radians, positive to the "
-    "left",
+    "readings": "of a whole scan, in the order of `angles`: distances in metres, infinite or 0 for "
+    "none, or linear RGB from 0 to 1; resample other scans",
+    "bearing": "of the PoI in the sensor's frame (x ahead, y left), in radians, positive leftwards",
     "distance": "expected from the sensor to the PoI's centre, in metres",
     "is_known": "whether the detector has learned from such looks, see `learned`, and the scan was "
     "recorded around the bearing; if not, what is there stays open",
@@ -86,11 +85,10 @@ _MEANING = {
     "modality": "index of each robot's sensor in `modalities`",
     "works": "robots that have neither ended by NOP nor failed",
     "target": "PoI that each robot heads for, N for none",
-    "action": "PoI to look at next; N for NOP, which ends the robot's part; -1 if a value is not a "
-    "number",
+    "action": "PoI to look at next; N for NOP, the robot's end; -1 if a value is not a number",
     "values": "the policy's value of each action, NOP's last; the rules choose among the best",
 }
-"""Of inputs and outputs; those of encoders are features by the name of their sensor."""
+"""Of inputs and outputs."""
 
 
 def functions(config: Config) -> dict[str, Function]:
@@ -99,11 +97,11 @@ def functions(config: Config) -> dict[str, Function]:
     found = {"classify": _classify(config), "decide": _decide(config)}
     for m, name in enumerate(model.modalities):
         found |= {f"detect_{name}": _detect(config, m), f"weigh_{name}": _weigh(m)}
-        found |= {f"tell_{name}" if own_maps else f"write_{name}": _write(config, m, own_maps)}
+        found |= (
+            {f"tell_{name}": _tell(model, m)} if own_maps else {f"write_{name}": _write(model, m)}
+        )
     if own_maps:
         found["merge"] = _merge, {"sums": _real(_ROBOTS, _POIS, len(config.arena.classes))}
-    for subset in () if config.jmvae.reads_scans else model.subsets:
-        found[f"encode_{model.encoder_name(subset)}"] = _encode(model, subset)
     return found
 
 
@@ -135,41 +133,39 @@ def _weigh(m: int) -> Function:
     return weigh, {"apart": _real(_LOOKS)}
 
 
-def _write(config: Config, m: int, own_maps: bool) -> Function:
+def _tell(model: Jmvae, m: int) -> Function:
     def tell(models: Models, features: jax.Array, weight: jax.Array) -> Arrays:
         """The evidence of a look, for the sum of a robot's own looks."""
         return {"evidence": maps.log_likelihood(models, features, m, weight)}
 
+    return tell, {"features": _real(model.feature_sizes[m]), "weight": _real()}
+
+
+def _write(model: Jmvae, m: int) -> Function:
     def write(
-        models: Models, mean: jax.Array, std: jax.Array, seen: jax.Array, *look: jax.Array
+        models: Models,
+        mean: jax.Array,
+        std: jax.Array,
+        seen: jax.Array,
+        features: jax.Array,
+        weight: jax.Array,
     ) -> Arrays:
         """The belief about a PoI after a look."""
-        features, weight = look
         after = models.fusion.update(Belief(mean, std), seen, features, m, weight)
         return {"new_mean": after.mean, "new_std": after.std}
 
-    model = make_jmvae(config)
-    look = {"features": _real(model.feature_sizes[m]), "weight": _real()}
-    if own_maps:
-        return tell, look
-    before = {"mean": _real(model.latent_size), "std": _real(model.latent_size)}
-    return write, {**before, "seen": Struct((len(model.modalities),), bool), **look}
+    return write, {
+        "mean": _real(model.latent_size),
+        "std": _real(model.latent_size),
+        "seen": Struct((len(model.modalities),), bool),
+        **_tell(model, m)[1],
+    }
 
 
 def _merge(models: Models, sums: jax.Array) -> Arrays:
     """A robot's map, from what each robot has said of its own looks."""
     of_poi = jax.vmap(lambda total: maps.belief_of(models.fusion, total))
     return vars(of_poi(jnp.sum(sums, axis=0)))
-
-
-def _encode(model: Jmvae, subset: tuple[int, ...]) -> Function:
-    def encode(models: Models, *features: jax.Array) -> Arrays:
-        """The JMVAE's belief after a look by each of these."""
-        given = dict(zip(subset, features, strict=True))
-        of_each = tuple(given.get(m) for m in range(len(model.modalities)))
-        return vars(jmvae.posterior(models.jmvae, model, of_each))
-
-    return encode, {model.modalities[m]: _real(model.feature_sizes[m]) for m in subset}
 
 
 def _classify(config: Config) -> Function:
@@ -261,7 +257,7 @@ def _described(arrays: dict[str, Struct]) -> dict[str, dict[str, object]]:
         name: {
             "shape": [n if isinstance(n, int) else str(n) for n in array.shape],
             "dtype": array.dtype.name,
-            "about": _MEANING.get(name, "features, from its `detect`"),
+            "about": _MEANING[name],
         }
         for name, array in arrays.items()
     }
@@ -269,20 +265,15 @@ def _described(arrays: dict[str, Struct]) -> dict[str, dict[str, object]]:
 
 def _description(config: Config, models: Models) -> dict[str, object]:
     """Everything a reader of the file needs except the programs."""
-    prior, mission, viewpoint = models.fusion.prior, config.mission, config.viewpoint
+    prior, viewpoint = models.fusion.prior, config.viewpoint
+    own_maps = config.mission.communication.own_maps
     return {
         "modalities": config.modalities,
         "robots": config.carried,
         "classes": config.arena.classes,
         "labels": {name: config.labels(name) for name in config.modalities},
         "label_of_class": {name: config.label_of_class(name) for name in config.modalities},
-        "class_means": np.asarray(models.fusion.classes.mean).tolist(),
         "num_pois": config.arena.num_pois,
-        "pois": {
-            "radius": float(config.arena.poi_radius),
-            "height": POI_HEIGHT,
-            "about": "of the PoIs that the detectors know, in metres; half the side of boxes",
-        },
         "unseen": {name: np.asarray(x).tolist() for name, x in vars(prior).items()},
         "sensors": {sensor.name: _of_sensor(sensor) for sensor in sensors.make(config)},
         "learned": {
@@ -293,35 +284,22 @@ def _description(config: Config, models: Models) -> dict[str, object]:
             "min_distance": float(viewpoint.min_distance),
             "max_distance": float(viewpoint.max_distance),
             "max_bearing": round(math.radians(MAX_BEARING), 6),
-            "about": "from where the detectors have learned to look at a PoI: distances of its "
-            "centre, in metres, and the largest bearing to either side, in radians",
         },
         "mission": {"attempts": ATTEMPTS},
-        "remembered_looks": maps.MOST_LOOKS if mission.communication.own_maps else RECENT_LOOKS,
+        "remembered_looks": maps.MOST_LOOKS if own_maps else RECENT_LOOKS,
         "versions": {"jaxsense": __version__},
     }
 
 
 def _of_sensor(sensor: Sensor) -> dict[str, object]:
-    """How a scan is given to `detect`."""
+    """Directions of rays and width of the window that a detector reads, in radians; height in m."""
     rays = min((sensor.window - 1) * sensor.stride, len(sensor.angles) - 1)
     first = (len(sensor.angles) - 1 - rays) // 2
     return {
-        "readings": _unit(sensor),
         "angles": [round(float(angle), 6) for angle in sensor.angles],
         "height": float(sensor.height),
         "window": round(float(abs(sensor.angles[first + rays] - sensor.angles[first])), 6),
-        "about": "one reading for each ray; `angles` are the rays' directions in the sensor's "
-        "frame (x ahead, y left), in radians, positive to the left; `height` is that of the rays "
-        "above the floor, in metres; `window` is how wide a part of the scan the detector reads, "
-        "in radians",
     }
-
-
-def _unit(sensor: Sensor) -> str:
-    if sensor.measures_distance:
-        return "distances in metres, infinite or 0 for none"
-    return "linear RGB from 0 to 1" if sensor.channels == 3 else "readings"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -341,27 +319,17 @@ class Arguments:
         check_fields(self)
 
 
-def load(run: Path, trust: bool = False) -> tuple[Config, Models, Path]:
-    """Settings and models of a run, and where its archive goes by default.
-
-    Args:
-      run: its directory, `latest`, or `pretrained:PRESET`.
-      trust: whether to run the code of custom sensors.
-    """
-    if (given := str(run)).startswith(PREFIX) and not run.exists():
-        return *rundir.load(run), Path(f"{given.removeprefix(PREFIX)}.zip")
-    run = rundir.newest(run)
-    return *rundir.load(run, trust), run / "exported.zip"
-
-
 def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
-    path = arguments.out
+    run, path = arguments.run, arguments.out
+    is_run = run.exists() or not str(run).startswith(PREFIX)
     try:
         devices.start(1)
-        config, models, by_default = load(arguments.run, arguments.trust)
-        path = path or by_default
+        run = rundir.newest(run) if is_run else run
+        config, models = rundir.load(run, arguments.trust)
+        preset = str(run).removeprefix(PREFIX)
+        path = path or (run / "exported.zip" if is_run else Path(f"{preset}.zip"))
         with files.new(path) as file:
             file.write(content := archive(config, models))
     except FileExistsError:

@@ -26,7 +26,7 @@ def drawn(rng, contents, name, sizes):
             found = rng.integers(0, most.get(key, len(contents["modalities"])), shape)
         elif about["dtype"] == "bool":
             found = found > 0.3
-        elif key == "features" or name.startswith("encode"):  # probabilities
+        elif key == "features":  # probabilities
             found = found / found.sum()
         elif key in ("bearing", "distance"):  # as far as was learned
             found = 0.3 * found if key == "bearing" else found + 0.2

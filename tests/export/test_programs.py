@@ -6,7 +6,6 @@ import json
 import zipfile
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import onnx
 import pytest
@@ -20,11 +19,10 @@ from jaxsense.core.types import Belief
 from jaxsense.dqn import Travel, team_mdp
 from jaxsense.dqn.map_agent import observation
 from jaxsense.interfaces import robot
-from jaxsense.models import make_jmvae
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.tasks.pretrained import PRETRAINED
-from jaxsense.vae import detectors, jmvae, readout
+from jaxsense.vae import detectors, readout
 
 BATCH = 12
 TRAVEL = Travel(CONFIG.team.travel.view_distance)
@@ -147,21 +145,6 @@ def test_decisions_are_those_of_the_policy_and_the_rules(models, loaded):
 
     rows = check(loaded, "decide", decide, "action", "values")
     assert len({int(row["action"]) for row in rows}) > 1
-
-
-@pytest.mark.parametrize(
-    ("name", "given"), [("camera", [0]), ("lidar", [1]), ("camera+lidar", [0, 1])]
-)
-def test_encoders_give_what_jaxsense_gives(models, loaded, name, given):
-    @jax.jit
-    def encode(*features):
-        of_each = [None, None]
-        for m, x in zip(given, features, strict=True):
-            of_each[m] = x
-        mean, log_var = jmvae.encode(models.jmvae, make_jmvae(CONFIG), tuple(of_each))
-        return mean, jnp.exp(log_var / 2)
-
-    check(loaded, f"encode_{name}", encode, "mean", "std")
 
 
 def test_the_map_is_read_as_jaxsense_reads_it(models, loaded):
