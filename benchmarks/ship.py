@@ -8,18 +8,28 @@ it. The file of a task is never written again: another task is another version.
 import dataclasses
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 import jaxsense
-from jaxsense import Config
-from jaxsense.tasks import PRETRAINED, pretrained, registry
+from jaxsense import Bank, Config, Models
+from jaxsense.config import as_plain
+from jaxsense.core.types import Samples
+from jaxsense.tasks import PRETRAINED, Task, pretrained, registry
+from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import Origin
+from jaxsense.tasks.task import EPISODES, SEEDS
+from jaxsense.training.comparison import models_of
 
 _KEY = 20261126
 _LOOKS = 12288  # by each sensor, at all classes together
+_STATES, _STEPS = 1024, 12  # from which observations are scaled
+_LEAST_SPREAD = 1e-6  # below which a feature is constant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +81,7 @@ def ship(run: Path) -> list[Path]:
     command = f"python -m jaxsense.train --preset {preset} --seed {seed}"
     made = Origin(command, preset, seed, content["commit"], content["versions"])
     written = [pretrained.DATA / f"{preset}.npz"]
-    pretrained.write(written[0], config, trained, made)
+    write(written[0], {name: getattr(trained, name) for name in pretrained.PARTS}, config, made)
     freezing = FREEZINGS.get(preset)
     file = pretrained.DATA / f"{freezing.name}.npz" if freezing else None
     if freezing is not None and file is not None and not file.exists():
@@ -79,9 +89,73 @@ def ship(run: Path) -> list[Path]:
         look_key, scale_key = jax.random.split(jax.random.key(_KEY))
         number = _LOOKS // len(there.arena.classes)
         looks = jaxsense.detections(look_key, there, trained, number)
-        registry.freeze(scale_key, file, freezing.name, there, trained, looks, made)
+        freeze(scale_key, file, freezing.name, there, trained, looks, made)
         written.append(file)
     return written
+
+
+def freeze(
+    key: jax.Array,
+    file: Path,
+    name: str,
+    config: Config,
+    trained: Models,
+    looks: Samples,
+    made: Origin,
+) -> None:
+    """Writes the file of a task, whose name ends in `.npz`."""
+    parts, acting = (
+        models_of(config, trained.fusion, trained.look_values),
+        registry.agents_of(config),
+    )
+
+    def task(agent: str, scaling: Scaling) -> Task:
+        return registry.task_of(name, agent, config, parts, Bank(looks), scaling, jnp.zeros((0, 0)))
+
+    scaling = scaling_of(key, task(acting[0], Scaling(jnp.zeros(1), jnp.ones(1))))
+
+    def returns(agent: str) -> np.ndarray:
+        played = registry.reference_returns(task(agent, scaling), SEEDS, EPISODES)
+        return np.stack([*played.values()])
+
+    trees = {
+        "fusion": trained.fusion,
+        "look_values": trained.look_values,
+        "looks": looks,
+        "scaling": {"offset": scaling.offset, "scale": scaling.scale},
+        "returns": {agent: returns(agent) for agent in acting},
+    }
+    write(file, trees, config, made)
+
+
+def scaling_of(key: jax.Array, task: Task) -> Scaling:
+    """Means and standard deviations of features over states after random looks."""
+
+    def visit(key: jax.Array) -> jax.Array:
+        reset_key, walk_key = jax.random.split(key)
+        _, state = task.reset(reset_key)
+
+        def look(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            choice_key, step_key = jax.random.split(key)
+            chances = task.action_mask(state).at[-1].set(False)
+            action = jax.random.choice(choice_key, len(chances), p=chances / chances.sum())
+            after, _ = task.step(step_key, state, action)
+            return after, task.features(state)
+
+        return jax.lax.scan(look, state, jax.random.split(walk_key, _STEPS))[1]
+
+    found = jax.jit(jax.vmap(visit))(jax.random.split(key, _STATES))
+    found = found.reshape(-1, found.shape[-1])
+    spread = jnp.std(found, axis=0)
+    return Scaling(jnp.mean(found, axis=0), jnp.where(spread > _LEAST_SPREAD, spread, 1.0))
+
+
+def write(file: Path, trees: Mapping[str, Any], config: Config, made: Origin) -> None:
+    """Writes trees of arrays, with the settings and the origin of the models."""
+    arrays = {name: np.asarray(leaf) for name, leaf in pretrained.flat(trees).items()}
+    about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
+    text = np.array(json.dumps(about, allow_nan=False))
+    np.savez_compressed(file, allow_pickle=False, **{**arrays, "about": text})
 
 
 def main(argv: list[str]) -> None:

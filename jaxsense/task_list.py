@@ -13,7 +13,7 @@ from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
 from jaxsense.show.terminal import as_text
 from jaxsense.tasks import Task
-from jaxsense.tasks.registry import about, agents
+from jaxsense.tasks.registry import TASKS, agents
 from jaxsense.tasks.score import estimate
 from jaxsense.tasks.task import EPISODES, SEEDS
 
@@ -40,8 +40,8 @@ def main(argv: list[str] | None = None) -> None:
         cli.fail(PROGRAM, str(error))
     found = [tasks.make(name, agent) for name in tasks.registered() for agent in agents(name)]
     tell(as_text(rich.console.Console(), _table(found)))
-    for name in tasks.registered():
-        tell(f"{name}: {about(name)}.")
+    for name, about in TASKS.items():
+        tell(f"{name}: {about}.")
     tell(
         f"Returns are interquartile means over {SEEDS} seeds of {EPISODES:,} episodes, "
         f"stored with the tasks. {SCOREBOARD} in the source tree lists other policies.\n"

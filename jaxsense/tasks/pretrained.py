@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -13,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError, as_plain, from_plain
+from jaxsense.config import Config, ConfigError, from_plain
 from jaxsense.config.section import require_32_bits
 from jaxsense.models import Models
 
@@ -27,9 +26,8 @@ PRETRAINED = ("default", "noisy", "many", "raw", "team")
 PREFIX = "pretrained:"
 """What stands before a preset's name where the directory of a run may stand, too."""
 
-_ABOUT = "about"
 # The others follow from the settings.
-_PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"
+PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,35 +52,20 @@ def load_pretrained(preset: str) -> tuple[Config, Models]:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRETRAINED)}")
     arrays, config, _ = read(DATA / f"{preset}.npz")
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    parts = {name: fill(arrays, name, getattr(shapes, name)) for name in _PARTS}
+    parts = {name: fill(arrays, name, getattr(shapes, name)) for name in PARTS}
     return config, models.make_models(config, **parts)
 
 
-def write(file: Path, config: Config, trained: Models, made: Origin) -> None:
-    """Writes what `load_pretrained` reads, to a new file that ends in `.npz`."""
-    write_trees(file, {name: getattr(trained, name) for name in _PARTS}, config, made)
-
-
-def write_trees(file: Path, trees: Mapping[str, PyTree], config: Config, made: Origin) -> None:
-    """Writes trees of arrays, with the settings and the origin of the models."""
-    arrays = {name: np.asarray(leaf) for name, leaf in _flat(dict(trees)).items()}
-    about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
-    text = np.array(json.dumps(about, allow_nan=False))
-    part = file.with_suffix(".part.npz")
-    np.savez_compressed(part, allow_pickle=False, **{**arrays, _ABOUT: text})
-    os.replace(part, file)
-
-
 def read(file: Path) -> tuple[Arrays, Config, Origin]:
-    """Reads what `write_trees` wrote: arrays by their places, settings and origin."""
+    """Arrays by their places in trees, settings and origin, from a file of `benchmarks.ship`."""
     with np.load(file, allow_pickle=False) as found:
         arrays = {name: found[name] for name in found.files}
-    about = json.loads(str(arrays.pop(_ABOUT)))
+    about = json.loads(str(arrays.pop("about")))
     return arrays, from_plain(about["config"]), Origin(**about["origin"])
 
 
 def fill(arrays: Arrays, name: str, shapes: T) -> T:
-    """A tree that `write_trees` was given, from the arrays that `read` returns."""
+    """The tree of a name, from the arrays that `read` returns."""
 
     def leaf(place: str, shape: jax.ShapeDtypeStruct) -> jax.Array:
         found = arrays.get(place)
@@ -91,12 +74,12 @@ def fill(arrays: Arrays, name: str, shapes: T) -> T:
             raise ValueError(f"{place} {shown}: must have shape {shape.shape}")
         return jnp.asarray(found, shape.dtype)
 
-    places = _flat({name: shapes})
+    places = flat({name: shapes})
     leaves = [leaf(place, shape) for place, shape in places.items()]
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
-def _flat(trees: Mapping[str, PyTree]) -> dict[str, PyTree]:
+def flat(trees: Mapping[str, PyTree]) -> dict[str, PyTree]:
     """The leaves of trees, by their places in them."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(trees)
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

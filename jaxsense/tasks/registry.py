@@ -1,31 +1,23 @@
-"""The frozen tasks by name, and how one is frozen."""
+"""The frozen tasks by name."""
 
 import dataclasses
 from collections.abc import Iterable
-from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.section import require_32_bits
-from jaxsense.core.types import Key, Samples
+from jaxsense.core.types import Key
+from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.environment import Scaling
-from jaxsense.tasks.pretrained import (
-    DATA,
-    PRETRAINED,
-    Arrays,
-    Origin,
-    fill,
-    read,
-    write_trees,
-)
-from jaxsense.tasks.task import EPISODES, SEEDS, MapTask, Task, TeamTask, fixed_draws, key_of_seed
+from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin, fill, read
+from jaxsense.tasks.task import MapTask, Task, TeamTask, fixed_draws, key_of_seed
 from jaxsense.training.comparison import models_of
 
 TASKS = {
@@ -36,20 +28,10 @@ TASKS = {
 }
 """The frozen tasks, and what is special in each."""
 
-_STATES, _STEPS = 1024, 12  # from which observations are scaled
-_LEAST_SPREAD = 1e-6  # below which a feature is constant
-_NONE = np.zeros((0, 0))
-
 
 def registered() -> tuple[str, ...]:
     """Lists the names of all tasks that `make` accepts."""
     return tuple(TASKS)
-
-
-def about(name: str) -> str:
-    """Describes a task in a few words."""
-    _require_name(name)
-    return TASKS[name]
 
 
 def origin(name: str) -> Origin:
@@ -61,7 +43,7 @@ def origin(name: str) -> Origin:
 def agents(name: str) -> tuple[str, ...]:
     """Lists the agents of a task that `make` accepts."""
     _require_name(name)
-    return _agents(read(DATA / f"{name}.npz")[1])
+    return agents_of(read(DATA / f"{name}.npz")[1])
 
 
 def make(name: str, agent: str | None = None) -> Task:
@@ -82,13 +64,18 @@ def make(name: str, agent: str | None = None) -> Task:
     _require_name(name)
     require_32_bits()
     arrays, config, _ = read(DATA / f"{name}.npz")
+    acting = agents_of(config)
+    agent = acting[0] if agent is None else agent
+    if agent not in acting:
+        raise ConfigError("agent", agent, f"must be one of {', '.join(acting)}")
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
     fusion = fill(arrays, "fusion", shapes.fusion)
     values = fill(arrays, "look_values", shapes.look_values)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
     parts = models_of(config, fusion, values)
-    return _made(name, agent, config, parts, looks, scaling, arrays)
+    returns = jnp.asarray(arrays[f"returns/{agent}"])
+    return task_of(name, agent, config, parts, looks, scaling, returns)
 
 
 def as_task(task: Task | str, agent: str | None = None) -> Task:
@@ -118,32 +105,6 @@ def require_unchanged(task: Task) -> None:
         raise ConfigError("task", task, expected)
 
 
-def freeze(
-    key: Key, file: Path, name: str, config: Config, trained: Models, looks: Samples, made: Origin
-) -> None:
-    """Writes the file of a task.
-
-    Args:
-      file: a new file; its name ends in `.npz`.
-    """
-    parts, bank = models_of(config, trained.fusion, trained.look_values), Bank(looks)
-    unscaled = Scaling(jnp.zeros(1), jnp.ones(1))
-    scaling = _scaling(key, _made(name, None, config, parts, bank, unscaled, {}))
-
-    def returns(agent: str) -> np.ndarray:
-        task = _made(name, agent, config, parts, bank, scaling, {})
-        return np.stack([*reference_returns(task, SEEDS, EPISODES).values()])
-
-    trees = {
-        "fusion": trained.fusion,
-        "look_values": trained.look_values,
-        "looks": looks,
-        "scaling": {"offset": scaling.offset, "scale": scaling.scale},
-        "returns": {agent: returns(agent) for agent in _agents(config)},
-    }
-    write_trees(file, trees, config, made)
-
-
 @fixed_draws()
 def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.ndarray]:
     """Mean returns of the policies to compare with."""
@@ -165,60 +126,33 @@ def _require_name(name: str, known: Iterable[str] = TASKS) -> None:
         raise ConfigError("name", name, f"must be one of {', '.join(known)}")
 
 
-def _agents(config: Config) -> tuple[str, ...]:
+def agents_of(config: Config) -> tuple[str, ...]:
     """Who acts in a task with some settings."""
     learner = models.make_agent(config).learner
     return tuple(dict.fromkeys(map(learner, config.modalities)))
 
 
-def _made(
+def task_of(
     name: str,
-    agent: str | None,
+    agent: str,
     config: Config,
     parts: Models,
     looks: Bank,
     scaling: Scaling,
-    arrays: Arrays,
+    returns: jax.Array,
 ) -> Task:
-    """The task of some settings, networks and looks; `arrays` hold returns of references."""
-    acting = _agents(config)
-    agent = acting[0] if agent is None else agent
-    if agent not in acting:
-        expected = "must be one of " if len(acting) > 1 else "must be "
-        raise ConfigError("agent", agent, expected + ", ".join(acting))
-    parts_of_all: dict[str, PyTree] = {
-        "mdp": make_mdp(config, parts, looks),
+    """The task of some settings, networks, looks and returns of the references."""
+    shared: dict[str, Any] = {
         "models": parts,
         "scaling": scaling,
-        "returns": jnp.asarray(arrays.get(f"returns/{agent}", _NONE)),
+        "returns": returns,
         "name": name,
         "agent": agent,
         "modalities": config.modalities,
     }
-    if config.dqn.task == "team":
+    mdp = make_mdp(config, parts, looks)
+    if isinstance(mdp, TeamMdp):
         # A task is a whole mission.
-        parts_of_all["mdp"] = dataclasses.replace(parts_of_all["mdp"], partly_seen=0.0)
-        return TeamTask(**parts_of_all, robots=jnp.array(config.modality_of_robot, jnp.int32))
-    return MapTask(**parts_of_all, modality=config.modalities.index(agent))
-
-
-def _scaling(key: Key, task: Task) -> Scaling:
-    """Means and standard deviations of features over states after random looks."""
-
-    def visit(key: Key) -> jax.Array:
-        reset_key, walk_key = jax.random.split(key)
-        _, state = task.reset(reset_key)
-
-        def look(state, key: Key):
-            choice_key, step_key = jax.random.split(key)
-            chances = task.action_mask(state).at[-1].set(False)
-            action = jax.random.choice(choice_key, len(chances), p=chances / chances.sum())
-            after, _ = task.step(step_key, state, action)
-            return after, task.features(state)
-
-        return jax.lax.scan(look, state, jax.random.split(walk_key, _STEPS))[1]
-
-    found = jax.jit(jax.vmap(visit))(jax.random.split(key, _STATES))
-    found = found.reshape(-1, found.shape[-1])
-    spread = jnp.std(found, axis=0)
-    return Scaling(jnp.mean(found, axis=0), jnp.where(spread > _LEAST_SPREAD, spread, 1.0))
+        whole = dataclasses.replace(mdp, partly_seen=0.0)
+        return TeamTask(mdp=whole, robots=jnp.array(config.modality_of_robot, jnp.int32), **shared)
+    return MapTask(mdp=mdp, modality=config.modalities.index(agent), **shared)

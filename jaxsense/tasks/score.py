@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -123,7 +123,7 @@ class Score:
 @fixed_draws()
 def score(
     task: Task | str,
-    policy: Policy | Recurrent | Sequence[Policy | Recurrent],
+    policy: Policy | Recurrent | list[Policy | Recurrent],
     *,
     agent: str | None = None,
     episodes: int = EPISODES,
@@ -142,27 +142,21 @@ def score(
       numbers are, and no training should see them.
 
     Raises:
-      ConfigError: if there is no such task or agent, if a task was changed and kept its name, or if
-        a policy is not such a function or returns values of another shape or dtype.
-      ValueError: if a policy's actions do not exist, or if JAX cannot trace it.
+      ConfigError: if there is no such task or agent, if a task was changed and kept its name, if a
+        policy is not such a function, or if its actions do not exist.
+      ValueError: if JAX cannot trace a policy, or it returns no integer.
     """
     checks.require_number("episodes", episodes)
     task = as_task(task, agent)
     require_unchanged(task)
-    if isinstance(policy, str):  # a sequence, too
-        raise ConfigError("policy", policy, _IS_POLICY)
-    policies = [policy] * SEEDS if not isinstance(policy, Sequence) else list(policy)
+    policies = list(policy) if isinstance(policy, list | tuple) else [policy] * SEEDS
     if not policies:
         raise ConfigError("policy", policy, "must be one policy or several")
     seeds = len(policies)
     keys = [key_of_seed(seed) for seed in range(seeds)]
-    own = {id(each): _recurrent(each) for each in policies}
-    seen = jax.ShapeDtypeStruct((task.observation_size,), jnp.float32)
-    for each in own.values():
-        jax.eval_shape(functools.partial(_choose, each.act), keys[0], each.memory, seen)
-    played = {name: _player(each) for name, each in own.items()}
+    players = {id(each): _player(each) for each in policies}
     pairs = zip(keys, policies, strict=True)
-    returns = [played[id(each)](key, task, episodes) for key, each in pairs]
+    returns = [players[id(each)](key, task, episodes) for key, each in pairs]
     if task.name in TASKS and episodes == EPISODES and seeds <= SEEDS:
         known = np.asarray(task.returns)[:, :seeds]
         references = dict(zip(task.references, known, strict=True))
@@ -243,9 +237,8 @@ def mean_return(key: Key, task: Task | str, policy: Policy | Recurrent, episodes
       policy: see `score`; compiled anew in each call, unless it is a pytree of numbers.
 
     Raises:
-      ConfigError: if the policy is not such a function, returns values of another shape or dtype,
-        or takes actions that do not exist.
-      ValueError: if JAX cannot trace it, or another argument is wrong.
+      ConfigError: if the policy is not such a function, or its actions do not exist.
+      ValueError: if JAX cannot trace it, it returns no integer, or another argument is wrong.
     """
     checks.require_key(key)
     checks.require_number("episodes", episodes)
@@ -254,20 +247,24 @@ def mean_return(key: Key, task: Task | str, policy: Policy | Recurrent, episodes
 
 def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
     """`mean_return` of a policy, which is compiled once for all keys."""
-    given = _recurrent(policy)
-    act, memory, play = given.act, given.memory, _play_compiled
+    act, memory = policy, ()
+    if isinstance(policy, Recurrent):
+        act, memory = policy.act, policy.memory
+        require_function("policy.act", act, 3, _IS_RECURRENT)
+    else:
+        require_function("policy", act, 2, _IS_POLICY)
+        act = Partial(_forget, act)
+    play = _play_compiled
     if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
         # A program of its own, which goes when the policy does.
         own = functools.partial(_play, act)
         play, act = jax.jit(lambda _, *rest: own(*rest), static_argnums=4), ()
 
     def checked(key: Key, task: Task, episodes: int) -> float:
-        last, found = task.num_actions - 1, float(play(act, memory, key, task, episodes))
+        found = float(play(act, memory, key, task, episodes))
         if np.isnan(found):
-            by_user: object = given.act
-            if isinstance(by_user, Partial) and by_user.func is _forget:
-                (by_user,) = by_user.args
-            raise ConfigError("policy", by_user, f"must return actions from 0 to {last}")
+            last = task.num_actions - 1
+            raise ConfigError("policy", policy, f"must return actions from 0 to {last}")
         return found
 
     return checked
@@ -284,60 +281,24 @@ def _play(
 _play_compiled = jax.jit(_play, static_argnums=4)
 
 
-def _recurrent(policy: Policy | Recurrent) -> Recurrent:
-    """The policy, with empty memory if it has none; raises `ConfigError` if it is neither."""
-    if isinstance(policy, Recurrent):
-        require_function("policy.act", policy.act, 3, _IS_RECURRENT)
-        return policy
-    require_function("policy", policy, 2, _IS_POLICY)
-    return Recurrent(Partial(_forget, policy), ())
-
-
 def _choose(
     act: Act[PyTree], key: Key, memory: PyTree, observation: jax.Array
-) -> tuple[jax.Array, PyTree]:
-    """Action and memory of a policy, both checked while it is traced."""
+) -> tuple[Int[Array, ""], PyTree]:
+    """Action and memory of a policy; raises `ValueError` unless the action is an integer."""
     try:
-        found = act(key, memory, observation)
+        action, memory = act(key, memory, observation)
     except _UNTRACEABLE as error:
         expected = "must be a function that JAX can trace; wrap others in tasks.on_host"
         raise ValueError(f"policy: {expected}") from error
-    if not isinstance(found, tuple | list) or len(found) != 2:
-        raise _returned(act, "(action, memory)", _form(found))
-    action, after = found
-    structures = jax.tree.structure(memory), jax.tree.structure(after)
-    if structures[0] != structures[1]:
-        raise _returned(act, f"memory of structure {structures[0]}", str(structures[1]))
-    for old, new in zip(jax.tree.leaves(memory), jax.tree.leaves(after), strict=True):
-        # Loops promote a weak dtype, such as that of a Python number.
-        dtype = jnp.result_type(old, new) if old.weak_type else old.dtype
-        if (old.shape, dtype) != (jnp.shape(new), jnp.result_type(new)):
-            raise _returned(act, f"memory as before, {_form(old)}", _form(new))
-    return _checked(act, action), after
-
-
-def _checked(policy: Callable[..., object], action: object) -> Int[Array, ""]:
-    """The action; raises `ConfigError` about its policy unless it is a scalar integer."""
-    is_scalar = isinstance(action, _NUMBERS) and jnp.shape(action) == ()
-    if not is_scalar or not jnp.issubdtype(jnp.result_type(action), jnp.integer):
-        raise _returned(policy, "an integer of shape []", _form(action))
-    return jnp.asarray(action, jnp.int32)
-
-
-def _returned(policy: Callable[..., object], expected: str, found: str) -> ConfigError:
-    """The error about what a policy returned."""
-    return ConfigError("policy", policy, f"must return {expected}; not {found}")
-
-
-def _form(value: object) -> str:
-    """Dtype and shape of an array or a number; the type of something else."""
-    if isinstance(value, _NUMBERS):
-        return f"{jnp.result_type(value)}{[*jnp.shape(value)]}"
-    return type(value).__name__
+    found = jnp.asarray(action)
+    if found.shape or not jnp.issubdtype(found.dtype, jnp.integer):
+        form = f"{found.dtype}{[*found.shape]}"
+        raise ValueError(f"policy: must return an integer of shape []; not {form}")
+    return found.astype(jnp.int32), memory
 
 
 def _forget(
     policy: Policy, key: Key, memory: tuple[()], observation: jax.Array
 ) -> tuple[jax.Array, tuple[()]]:
     """A policy without memory."""
-    return _checked(policy, policy(key, observation)), memory
+    return policy(key, observation), memory

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsense
+from benchmarks import ship
 from jaxsense import tasks
 from jaxsense.core.types import Belief
 from jaxsense.tasks import pretrained
@@ -79,10 +80,9 @@ def test_a_training_repeats_the_models_that_travel(tmp_path):
 def test_what_was_written_is_read_again(tmp_path):
     tree = {"beliefs": (Belief(jnp.arange(3.0), jnp.ones(3)), [jnp.int32(7)]), "none": ()}
     config, made = jaxsense.PRESETS["smoke"], tasks.origin("default")
-    pretrained.write_trees(tmp_path / "a.npz", {"tree": tree}, config, made)
+    ship.write(tmp_path / "a.npz", {"tree": tree}, config, made)
     arrays, *about = pretrained.read(tmp_path / "a.npz")
     assert about == [config, made]
     chex.assert_trees_all_equal(pretrained.fill(arrays, "tree", tree), tree)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
     with pytest.raises(ValueError, match="tree/x is missing"):
         pretrained.fill(arrays, "tree", {"x": jnp.zeros(2)})

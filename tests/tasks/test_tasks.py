@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsense
+from benchmarks import ship
 from jaxsense.dqn import team_mdp
 from jaxsense.tasks import registry
 from jaxsense.tasks.task import EPISODES, SEEDS, key_of_seed
@@ -107,8 +108,8 @@ def test_a_task_is_frozen_from_models(tmp_path, monkeypatch):
     looks = jaxsense.detections(KEY, config, models, 8)
     made = jaxsense.tasks.origin("default")
     monkeypatch.setattr(registry, "DATA", tmp_path)
-    monkeypatch.setattr(registry, "EPISODES", 2)
-    registry.freeze(KEY, tmp_path / "map-v0.npz", "map-v0", config, models, looks, made)
+    monkeypatch.setattr(ship, "EPISODES", 2)
+    ship.freeze(KEY, tmp_path / "map-v0.npz", "map-v0", config, models, looks, made)
     task = jaxsense.make("map-v0", "lidar")
     np.testing.assert_array_equal(task.mdp.looks.features[1], looks[1])
     np.testing.assert_array_equal(task.mdp.fusion.classes.mean, models.fusion.classes.mean)
