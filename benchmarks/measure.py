@@ -17,8 +17,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from jaxsense.run import cli, devices, version
+from jaxsense.run.compilation import shapes_of, trace
 from jaxsense.run.devices import Workers
-from jaxsense.run.kept import shapes_of, trace
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 
@@ -161,22 +161,24 @@ def compiled(
     threads as divide it; of threads, the side gives the outputs of each.
     """
     if workers.mesh is not None:
-        share = devices.part(shapes_of(args), 0, workers.shares)
-        alone = trace(function, share)
+        alone = trace(function, devices.share(shapes_of(args), workers.mesh))
         function = devices.spread(alone.__call__, workers.mesh)
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     # A single worker also takes what has no rows, such as a key.
     rows = len(jax.tree.leaves(args)[0]) if workers.threads > 1 else 1
     threads = max(n for n in range(1, workers.threads + 1) if rows % n == 0)
-    parts = [devices.part(args, i, threads) for i in range(threads)]
+    parts = [args]
+    if threads > 1:
+        split = lambda x, i: x[i * rows // threads : (i + 1) * rows // threads]  # noqa: E731
+        parts = [jax.tree.map(lambda x, i=i: split(x, i), args) for i in range(threads)]
     options = devices.compiler_options(runs_long=True, wide_vectors=wide_vectors)
     begin = time.perf_counter()
     program = jax.jit(function).lower(*parts[0]).compile(options)
     compile_s = time.perf_counter() - begin
 
     def run() -> list[PyTree]:
-        work_on = lambda i: jax.block_until_ready(program(*parts[i]))  # noqa: E731
-        return devices.side_by_side(work_on, threads)
+        work_on = lambda part: jax.block_until_ready(program(*part))  # noqa: E731
+        return devices.side_by_side(work_on, parts, threads)
 
     number = threads if workers.mesh is None else workers.number
     return Side(run, work, batch, compile_s, number)

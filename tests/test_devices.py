@@ -16,9 +16,8 @@ from smoke import SMOKE, error_line, without_times
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices
-from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.compilation import Compiler, Kept, Program, RowProgram, trace
 from jaxsense.run.devices import Workers
-from jaxsense.run.kept import Kept, trace
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim import arena as arenas
 
@@ -32,10 +31,9 @@ def test_a_spread_function_gives_what_it_gives_alone():
         return {"sum": x.sum(axis=1) * scale, "x": x}
 
     x = jnp.arange(12.0).reshape(6, 2)
-    spread = jax.jit(devices.spread(function, mesh, whole=(1,)))
-    chex.assert_trees_all_close(spread(x, jnp.float32(3)), function(x, jnp.float32(3)))
-    assert spread(x, jnp.float32(3))["sum"].sharding.num_devices == 2
-    assert devices.spread(function, None) is function
+    spread = jax.jit(devices.spread(lambda scale, x: function(x, scale), mesh, whole=1))
+    chex.assert_trees_all_close(spread(jnp.float32(3), x), function(x, jnp.float32(3)))
+    assert spread(jnp.float32(3), x)["sum"].sharding.num_devices == 2
 
 
 def drive(speeds):
@@ -70,8 +68,8 @@ def test_workers_share_the_rows_of_a_program(make, is_kept, tmp_path):
     scale, x = jnp.float32(2), np.arange(12.0, dtype=np.float32).reshape(6, 2)
     kept = Kept(tmp_path / "cache") if is_kept else None
     with Compiler(Monitor(), kept) as compiler:
-        program = Program(compiler, "stage", "run")
-        shapes = program.compile(function, scale, x, workers=workers, whole=(0,))
+        program = RowProgram(Program(compiler, "stage", "run"), workers)
+        shapes = program.compile(function, scale, x, whole=1)
         output = program(scale, x)
     assert seen == [(6 // workers.number, 2)]
     assert (shapes["scaled"].shape, shapes["sums"].shape) == ((6, 2), (6,))
@@ -97,7 +95,7 @@ from pathlib import Path
 import jax
 import scipy.stats  # whose import filters warnings
 import jaxsense
-from jaxsense.run import devices, kept
+from jaxsense.run import compilation, devices
 
 def state():
     return dict(os.environ), dict(jax.config.values), gc.get_threshold(), warnings.filters[:]
@@ -105,7 +103,7 @@ def state():
 before = state()
 devices.threads()
 devices.compiler_options()
-kept.Kept(Path(sys.argv[1]))
+compilation.Kept(Path(sys.argv[1]))
 task = jaxsense.make("map-v0", "camera")
 jaxsense.score(task, lambda key, observation: jax.numpy.int32(3), episodes=2)
 jaxsense.load_pretrained("noisy")
@@ -140,7 +138,7 @@ def test_calls_are_asked_to_end_when_one_fails(error):
         assert stopped.wait(10)
 
     with pytest.raises(error):
-        devices.side_by_side(call, 2, stop=stopped.set)
+        devices.side_by_side(call, [0, 1], 2, fail=lambda error: stopped.set())
 
 
 DECOMPOSED = """
@@ -153,7 +151,8 @@ def main():
     again = lambda _, x: jnp.linalg.cholesky(x @ x)
     program = jax.jit(lambda x: jax.lax.fori_loop(0, 100, again, x)).lower(matrices).compile()
     for _ in range(3):
-        devices.side_by_side(lambda i: jax.block_until_ready(program(matrices)), workers.threads)
+        each = lambda x: jax.block_until_ready(program(x))
+        devices.side_by_side(each, [matrices] * workers.threads, workers.threads)
     print(workers.threads)
 
 output.run(main)
@@ -169,12 +168,7 @@ def test_programs_side_by_side_do_not_wait_for_each_other_for_ever():
     assert int(told) == 2
 
 
-def test_parts_are_joined_where_jax_can_take_them_over():
-    shapes = (jax.ShapeDtypeStruct((6, 5), jnp.float32), jax.ShapeDtypeStruct((6,), jnp.bool_))
-    rows = lambda i: (np.full((2, 5), i, np.float32), np.full(2, i == 1))  # noqa: E731
-    whole = devices.joined(rows, 3, 2, shapes)
-    np.testing.assert_array_equal(whole[0][:, 0], [0, 0, 1, 1, 2, 2])
-    np.testing.assert_array_equal(whole[1], [0, 0, 1, 1, 0, 0])
-    for x in whole:
-        taken = jax.device_put(x)
-        assert taken.unsafe_buffer_pointer() == x.ctypes.data
+def test_jax_takes_over_what_parts_are_joined_in():
+    whole = devices.empty(jax.ShapeDtypeStruct((6, 5), jnp.float32))
+    assert (whole.shape, whole.dtype) == ((6, 5), np.float32)
+    assert jax.device_put(whole).unsafe_buffer_pointer() == whole.ctypes.data

@@ -17,10 +17,8 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, version
-from jaxsense.run import kept as kept_programs
-from jaxsense.run.compilation import Compiler, Program
-from jaxsense.run.kept import Kept
+from jaxsense.run import cli, compilation, version
+from jaxsense.run.compilation import Compiler, Kept, Program
 from jaxsense.run.monitor import Monitor
 
 ONE = jnp.float32(1)
@@ -130,8 +128,7 @@ def two_processes(tmp_path_factory):
     path = tmp_path_factory.mktemp("kept")
     code = """if True:
         import sys, jax, jax.numpy as jnp
-        from jaxsense.run.compilation import Compiler, Program
-        from jaxsense.run.kept import Kept, use_cache
+        from jaxsense.run.compilation import Compiler, Kept, Program, use_cache
         from jaxsense.run.monitor import Monitor
         from pathlib import Path
         use_cache(Path(sys.argv[1]))
@@ -180,7 +177,7 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
         path.write_text("precious", encoding="utf-8")
     link = kept.path / f"stage-{32 * '1'}.stablehlo"
     link.symlink_to(theirs[0])
-    monkeypatch.setattr(kept_programs, "_MAX_KEPT", 2)
+    monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
     assert all(path.exists() for path in (*theirs, link))
@@ -218,9 +215,7 @@ def test_programs_of_custom_sensors_are_not_kept(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no users")
-@pytest.mark.parametrize(
-    ("name", "begin"), [("compiled", kept_programs.use_cache), ("traced", Kept)]
-)
+@pytest.mark.parametrize(("name", "begin"), [("compiled", compilation.use_cache), ("traced", Kept)])
 def test_a_directory_of_others_is_refused(tmp_path, monkeypatch, name, begin):
     begin(tmp_path)
     match = f"{name} must be a directory that you own"

@@ -10,8 +10,7 @@ import jax
 
 from jaxsense.config import Config, ConfigError, options
 from jaxsense.config.section import require_32_bits
-from jaxsense.run import kept
-from jaxsense.run.kept import Kept
+from jaxsense.run.compilation import Kept, use_cache
 from jaxsense.run.output import complain, tell
 
 T = TypeVar("T")
@@ -88,7 +87,7 @@ def keep_programs(
         return None
     try:
         directory = directory.expanduser()
-        kept.use_cache(directory)
+        use_cache(directory)
         if config.named_code or has_own_code:
             return None
         return Kept(directory, jax.tree.structure(config))

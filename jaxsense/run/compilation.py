@@ -1,18 +1,178 @@
-"""Compiles programs in the background."""
+"""Compiles programs in the background, and keeps them in a directory for later runs.
+
+JAX's cache finds compiled programs by their traces. Tracing takes as long as everything else, so
+another directory holds the traces, found by all that tracing depends on.
+"""
 
 import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import stat
+import warnings
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from typing import Literal
+from pathlib import Path
+from typing import Literal, NamedTuple, TypeAlias
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+from jax import export
+from jax.sharding import Mesh
 from jaxtyping import PyTree
 
-from jaxsense.run import devices
-from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.kept import Function, Kept, Traced, shapes_of, trace
+from jaxsense.run import devices, files, version
+from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor
+from jaxsense.run.output import complain
+
+Function: TypeAlias = Callable[..., PyTree]
+
+_MAX_KEPT = 512  # traced programs; a run has about twenty
+_MAX_BYTES = 2**31  # of compiled programs
+_SUFFIX = f"-{32 * '[0-9a-f]'}.stablehlo"
+_ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
+
+
+class Traced(NamedTuple):
+    """A traced program that takes and returns flat leaves, and the structure of its results.
+
+    `jax.export` could write structures itself, but only of classes that are registered with it,
+    once per process and name.
+    """
+
+    flat: export.Exported
+    structure: object
+
+    def __call__(self, *args: PyTree) -> PyTree:
+        """Calls the program with arguments of the structure with which it was traced."""
+        return jax.tree.unflatten(self.structure, self.flat.call(*jax.tree.leaves(args)))
+
+
+def trace(function: Function, args: PyTree) -> Traced:
+    """Traces a program and lowers it, apart from whatever calls it.
+
+    Raises:
+      NotImplementedError: if it calls something that JAX cannot export, such as the host.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    results: list[object] = []
+
+    def flat(*leaves: jax.Array) -> list[jax.Array]:
+        output = function(*jax.tree.unflatten(structure, leaves))
+        results.append(jax.tree.structure(output))
+        return jax.tree.leaves(output)
+
+    exported = export.export(jax.jit(flat))(*shapes_of(leaves))
+    return Traced(exported, results[-1])
+
+
+def shapes_of(args: PyTree) -> PyTree[jax.ShapeDtypeStruct]:
+    """Shapes and dtypes of arguments; Python numbers count as JAX arrays."""
+    return jax.eval_shape(lambda args: args, args)
+
+
+class Kept:
+    """Cache of traced programs in the directory `path`."""
+
+    def __init__(self, directory: Path, *settings: object):
+        """Opens the cache, and removes the least recently used programs.
+
+        Args:
+          directory: holds the cache, in `traced`.
+          *settings: what programs close over outside jaxsense's source; their `repr` differs.
+
+        Raises:
+          OSError: if the directory cannot be made, or if other users may write to it: loading a
+            program runs it.
+        """
+        self.path, self._complain = directory / "traced", functools.cache(complain)
+        _make_private(self.path)
+        self._depends = repr((settings, _surroundings())).encode()
+        # Another run may be removing some too.
+        with contextlib.suppress(FileNotFoundError):
+            ours = [x for x in self.path.glob(f"*{_SUFFIX}") if x.is_file() and not x.is_symlink()]
+            for path in sorted(ours, key=lambda path: path.stat().st_mtime)[:-_MAX_KEPT]:
+                path.unlink()
+            files.remove_unfinished(self.path)
+
+    def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
+        """Finds a cached program, or traces and caches it; None if it cannot be exported.
+
+        A line to standard error says why it cannot be loaded, exported or cached.
+        """
+        shapes = repr(shapes_of(args)).encode()
+        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
+        path, traced = self.path / f"{name}-{digest}.stablehlo", None
+        # A run must not end because this one or the next will be slower: a damaged file, a program
+        # that calls something which JAX cannot export, a full disk.
+        try:
+            # A single wrong bit could end the process.
+            structure, flat = pickle.loads(files.without_digest(path.read_bytes()))
+            traced = Traced(export.deserialize(bytearray(flat)), structure)
+            path.touch()
+            return traced
+        except FileNotFoundError:
+            pass
+        except Exception as error:
+            self._tell(error)
+        try:
+            traced = trace(function, args)
+            content = pickle.dumps((traced.structure, bytes(traced.flat.serialize())))
+            files.write_digested(path, content, mode=0o600)
+        except Exception as error:
+            self._tell(error)
+        return traced
+
+    def _tell(self, error: Exception) -> None:
+        """Tells once why programs are slower to start than they could be."""
+        text = error.strerror if isinstance(error, OSError) else str(error)
+        reason = f"{type(error).__name__} {text}".splitlines()[0]
+        self._complain(f"jaxsense: {self.path}: a program must be traced again ({reason})")
+
+
+def use_cache(directory: Path) -> None:
+    """Makes JAX cache all compiled programs, also small ones, unless the user has set a cache.
+
+    Raises:
+      OSError: if the directory cannot be made, or if other users may write to it.
+    """
+    path = directory / "compiled"
+    _make_private(path)
+    # A cache that cannot be read or written, for example on a full disk, only costs time.
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"jax\._src\.compiler")
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_compilation_cache_max_size", _MAX_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _make_private(path: Path) -> None:
+    """Makes a directory private to this user; raises `OSError` if it exists and is not."""
+    with contextlib.suppress(FileExistsError):
+        path.mkdir(mode=0o700, parents=True)
+    found = path.lstat()
+    is_own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
+    if not (stat.S_ISDIR(found.st_mode) and is_own and not found.st_mode & 0o077):
+        raise PermissionError(f"{path} must be a directory that you own, with mode 0700")
+
+
+def _surroundings() -> list[object]:
+    """Code, versions, options and devices, on which tracing depends."""
+    variables = [(n, x) for n, x in os.environ.items() if n.startswith(("JAX_", "XLA_"))]
+    options = [*variables, *((name, str(x)) for name, x in jax.config.values.items())]
+    return [
+        version.SOURCE,
+        version.versions(),
+        # Where compiled programs are cached leaves them unchanged.
+        sorted((name, x) for name, x in options if "cache" not in name.lower()),
+        jax.devices()[0].client.platform_version,
+        [(device.platform, device.device_kind) for device in jax.devices()],
+    ]
 
 
 class Compiler:
@@ -41,15 +201,14 @@ class Program:
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name = stage, name
         self._compiled: Future[Function] = Future()
-        self._workers, self._whole, self._results = ALONE, (), None
-        self._rows: int | None = None  # of results, where the last are left out
+        self._places: tuple[jax.sharding.NamedSharding, ...] | None = None
 
     def compile(
         self,
         function: Function,
         *args: PyTree,
-        workers: Workers = ALONE,
-        whole: tuple[int, ...] = (),
+        mesh: Mesh | None = None,
+        whole: int = 0,
         **options: bool,
     ) -> PyTree[jax.ShapeDtypeStruct]:
         """Traces a function, unless its trace is cached, and starts to compile it.
@@ -57,8 +216,8 @@ class Program:
         Args:
           function: what to compile.
           *args: arguments or their shapes.
-          workers: share the rows of the arguments.
-          whole: positions of arguments that every worker gets undivided.
+          mesh: devices that share the rows of arguments and results; their number divides those.
+          whole: number of arguments, the first ones, that every device gets undivided.
           **options: see `devices.compiler_options`.
 
         Returns:
@@ -66,16 +225,14 @@ class Program:
         """
         if self._compiler.is_closed:
             raise CancelledError
-        self._workers, self._whole = workers, whole
-        with self._measure("compile_s"):
-            lowered, results = self._lower(function, self._padded(args))
-        self._results = devices.of_all_parts(results, workers.shares)
+        with self.measure("compile_s"):
+            lowered = self._lower(function, args, mesh, whole)
 
         def compile_lowered() -> None:
             if self._compiled.done():  # failed or released
                 return
             try:
-                with self._measure("compile_s"):
+                with self.measure("compile_s"):
                     supported = devices.compiler_options(**options)
                     compiled = lowered.compile(compiler_options=supported)
             except Exception as error:
@@ -86,73 +243,27 @@ class Program:
             devices.give_back_freed()
 
         self._compiler.threads.submit(compile_lowered)
-        if (rows := self._rows) is None:
-            return self._results
-        return jax.tree.map(lambda x: x.update(shape=(rows, *x.shape[1:])), self._results)
-
-    def _measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
-        """Adds the seconds of a block to those of the stage."""
-        return self._monitor.stopwatch.measure(kind, self._stage)
-
-    def _padded(self, args: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
-        """Arguments of which all workers get equally many rows, the first of them repeated."""
-        number = self._workers.shares
-        if number == 1:
-            return args
-
-        def pad(x: jax.Array | jax.ShapeDtypeStruct) -> jax.Array | jax.ShapeDtypeStruct:
-            given = x.shape[0]
-            if not (missing := -given % number):
-                return x
-            self._rows = given
-            if isinstance(x, jax.ShapeDtypeStruct):
-                return x.update(shape=(given + missing, *x.shape[1:]))
-            return x[jnp.arange(given + missing) % given]
-
-        return tuple(x if i in self._whole else jax.tree.map(pad, x) for i, x in enumerate(args))
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lowered.out_info)
 
     def _lower(
-        self, function: Function, args: tuple[PyTree, ...]
-    ) -> tuple[jax.stages.Lowered, PyTree]:
-        """A function ready to be compiled, and the shapes of a share's results; see `compile`."""
-        workers, whole = self._workers, self._whole
-        call, share = (
-            devices.part(args, 0, number, whole) for number in (workers.parts, workers.shares)
-        )
-        found = self._found_or_traced(function, share)
-        if found is not None:
-            spread = devices.spread(found.__call__, workers.mesh, whole)
-            jitted = jax.jit(spread, in_shardings=self._places(len(args)))
-            return jitted.lower(*shapes_of(call)), found.results
-        traced = jax.jit(function).trace(*call)
-        return traced.lower(), traced.out_info
+        self, function: Function, args: tuple[PyTree, ...], mesh: Mesh | None, whole: int
+    ) -> jax.stages.Lowered:
+        """A function ready to be compiled; see `compile`."""
+        shapes = shapes_of(args)
+        share = devices.share(shapes, mesh, whole)
+        traced, kept = None, self._compiler.kept
+        if kept is not None:
+            traced = kept.find_or_trace(f"{self._stage}-{self._name}", function, share)
+        if mesh is None:
+            return jax.jit(function if traced is None else traced.__call__).lower(*shapes)
+        # What devices run is traced apart; see `devices.spread`.
+        spread = devices.spread((traced or trace(function, share)).__call__, mesh, whole)
+        self._places = devices.places(mesh, len(args), whole)
+        return jax.jit(spread, in_shardings=self._places).lower(*shapes)
 
-    def _found_or_traced(self, function: Function, share: tuple[PyTree, ...]) -> Traced | None:
-        """The program apart from what calls it, which only caches and meshes need."""
-        if (kept := self._compiler.kept) is not None:
-            found = kept.find_or_trace(f"{self._stage}-{self._name}", function, share)
-            if found is not None:
-                return found
-        if self._workers.mesh is None:
-            return None
-        try:
-            return trace(function, share)
-        except NotImplementedError as error:
-            reason = f"{self._stage}: cannot be split over several devices; use one ({error})"
-            raise NotImplementedError(reason) from error
-
-    def _places(self, number: int) -> tuple[jax.sharding.NamedSharding, ...] | None:
-        """Where each of a number of arguments lies on a mesh; None without one."""
-        mesh = self._workers.mesh
-        return None if mesh is None else devices.shardings(mesh, number, self._whole)
-
-    def _put(self, args: tuple[PyTree, ...]) -> tuple[PyTree, ...]:
-        """Arguments where a mesh needs them."""
-        places = self._places(len(args))
-        if places is None:
-            return args
-        put = devices.put if jax.process_count() > 1 else jax.device_put
-        return put(args, places)
+    def measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
+        """Adds the seconds of a block to those of the stage."""
+        return self._monitor.stopwatch.measure(kind, self._stage)
 
     def fail(self, error: BaseException) -> None:
         """Makes all calls raise an error, unless the program is compiled already."""
@@ -173,22 +284,56 @@ class Program:
         return self._compiled.result()
 
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
-        """Runs a program that threads do not share, and leaves its results on the devices."""
+        """Runs the program, and returns before its results are ready."""
         compiled = self.wait()
         # JAX itself places what one process runs, and in missions most of it lies there already.
-        return compiled(*(args if jax.process_count() == 1 else self._put(args)))
+        if self._places is not None and jax.process_count() > 1:
+            args = tuple(map(devices.put, args, self._places))
+        return compiled(*args)
 
-    def __call__(self, *args: PyTree) -> PyTree:
-        """Runs the program, and blocks until its results are ready, on the host if it is split."""
-        compiled = self.wait()
-        number = self._workers.parts
+    def __call__(self, *args: PyTree) -> PyTree[jax.Array]:
+        """Runs the program, and blocks until its results are ready."""
+        self.wait()
+        with self.measure("run_s"):
+            return jax.block_until_ready(self.run(*args))
 
-        def run(i: int) -> PyTree:
-            return jax.block_until_ready(compiled(*devices.part(args, i, number, self._whole)))
 
-        with self._measure("run_s"):
-            args = self._put(self._padded(args))
-            output = devices.joined(run, number, self._workers.threads, self._results)
-            # Other programs run on one device.
-            output = output if self._workers.mesh is None else devices.fetched(output)
-            return output if self._rows is None else jax.tree.map(lambda x: x[: self._rows], output)
+class RowProgram:
+    """A program whose arguments and results are independent rows, which workers share.
+
+    Threads take a few rows at a time, devices of a mesh all at once. Results lie on the host.
+    """
+
+    def __init__(self, program: Program, workers: Workers):
+        self._program, self._workers = program, workers
+
+    def compile(
+        self, function: Function, *args: PyTree, whole: int
+    ) -> PyTree[jax.ShapeDtypeStruct]:
+        """Compiles it for as many rows as a call takes; see `Program.compile`."""
+        shapes, threads, mesh = shapes_of(args), self._workers.threads, self._workers.mesh
+        self._whole, number = whole, len(jax.tree.leaves(args[whole:])[0])
+        calls = 1 if mesh is not None else threads * -(-number // (threads * _ROWS_AT_ONCE))
+        devices_of_call = 1 if mesh is None else mesh.size
+        size = devices_of_call * -(-number // (calls * devices_of_call))
+        # Where rows cannot be divided, the last call takes the first ones again.
+        self._rows = [np.arange(i * size, (i + 1) * size) % number for i in range(calls)]
+        some = jax.tree.map(lambda x: x.update(shape=(size, *x.shape[1:])), shapes[whole:])
+        results = self._program.compile(function, *shapes[:whole], *some, mesh=mesh, whole=whole)
+        self._results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
+        return self._results
+
+    def __call__(self, *args: PyTree) -> PyTree[np.ndarray]:
+        """Runs the program for all rows."""
+        self._program.wait()
+        results = jax.tree.map(devices.empty, self._results)
+
+        def run(rows: np.ndarray) -> None:
+            some = jax.tree.map(lambda x: x[rows], args[self._whole :])
+            found = devices.fetched(self._program.run(*args[: self._whole], *some))
+            for all_rows, new in zip(*map(jax.tree.leaves, (results, found)), strict=True):
+                all_rows[rows] = new
+
+        with self._program.measure("run_s"):
+            devices.side_by_side(run, self._rows, self._workers.threads)
+        return results

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any, TypeAlias, TypeVar
 
@@ -22,7 +22,7 @@ from jaxsense.run import processes
 from jaxsense.run.output import cores
 
 T = TypeVar("T")
-Row = TypeVar("Row", jax.Array, np.ndarray, jax.ShapeDtypeStruct)
+R = TypeVar("R")
 
 Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
@@ -81,27 +81,15 @@ class Workers:
     Attributes:
       threads: number of threads, each with its own calls of a program; 1 with a mesh.
       mesh: from `make_mesh`; None for a single device.
-      calls: of each thread, one after the other, each with a part of its rows.
     """
 
     threads: int = 1
     mesh: Mesh | None = None
-    calls: int = 1
 
     @property
     def number(self) -> int:
         """Number of workers."""
         return self.threads if self.mesh is None else self.mesh.size
-
-    @property
-    def parts(self) -> int:
-        """Number of parts of a batch, each of which takes a call."""
-        return self.threads * self.calls
-
-    @property
-    def shares(self) -> int:
-        """Number of equal shares of a batch, one for each worker and call."""
-        return self.number * self.calls
 
 
 ALONE = Workers()
@@ -163,125 +151,39 @@ def make_mesh(number: int | None = None) -> Mesh:
     return Mesh(np.array(jax.devices()[:number]), (AXIS,))
 
 
-def shardings(mesh: Mesh, number: int, whole: tuple[int, ...]) -> tuple[NamedSharding, ...]:
-    """Shardings of `number` arguments along their first axis, except those at `whole`."""
-    return tuple(NamedSharding(mesh, place) for place in _places(number, whole))
+def places(mesh: Mesh, number: int, whole: int = 0) -> tuple[NamedSharding, ...]:
+    """Where arguments lie: the first `whole` ones on each device, rows of the others divided."""
+    undivided, divided = PartitionSpec(), PartitionSpec(AXIS)
+    return tuple(NamedSharding(mesh, undivided if i < whole else divided) for i in range(number))
 
 
-def _places(number: int, whole: tuple[int, ...]) -> tuple[PartitionSpec, ...]:
-    return tuple(PartitionSpec() if i in whole else PartitionSpec(AXIS) for i in range(number))
-
-
-def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
-    """Puts values, the same in every process, on every device of a mesh, or on the one device."""
+def share(
+    shapes: tuple[PyTree, ...], mesh: Mesh | None, whole: int = 0
+) -> tuple[PyTree[jax.ShapeDtypeStruct], ...]:
+    """What each device gets of arguments of such shapes; see `places`."""
     if mesh is None:
-        return jax.device_put(values)
-    return put((values,), shardings(mesh, 1, whole=(0,)))[0]
+        return shapes
+    rows = lambda x: x.update(shape=(x.shape[0] // mesh.size, *x.shape[1:]))  # noqa: E731
+    return *shapes[:whole], *jax.tree.map(rows, shapes[whole:])
 
 
-def put(args: tuple[PyTree, ...], places: tuple[NamedSharding, ...]) -> tuple[PyTree, ...]:
-    """Distributes arguments that every process has over the devices of all processes."""
+def put(values: PyTree, place: NamedSharding) -> PyTree[jax.Array]:
+    """Distributes values that every process has over the devices of all processes."""
 
-    def put_one(x: jax.Array, place: NamedSharding) -> jax.Array:
+    def put_one(x: jax.Array) -> jax.Array:
         if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(put_one(jax.random.key_data(x), place))
+            return jax.random.wrap_key_data(put_one(jax.random.key_data(x)))
         if isinstance(x, jax.Array) and x.sharding == place:
             return x
         local = np.asarray(x, jnp.result_type(x))
         return jax.make_array_from_callback(local.shape, place, lambda index: local[index])
 
-    return tuple(
-        jax.tree.map(lambda x: put_one(x, place), arg)  # noqa: B023
-        for arg, place in zip(args, places, strict=True)
-    )
+    return jax.tree.map(put_one, values)
 
 
-def spread(
-    function: Callable[..., PyTree], mesh: Mesh | None, whole: tuple[int, ...] = ()
-) -> Callable[..., PyTree]:
-    """Calls a function on each device with a part of its rows, independent of the other devices.
-
-    Args:
-      function: of pytrees of arrays, whose first axis is a batch of independent rows. With MJX
-        inside, it must be one that `kept.trace` returns: jaxlib 0.11.2 crashes while it compiles a
-        step of MJX whose constants `shard_map` sees, on a CPU and on accelerators.
-      mesh: from `make_mesh`; its size must divide the batch. Without a mesh, the batch stays whole.
-      whole: positions of arguments that every device gets undivided.
-
-    Returns:
-      The same function; call it under `jit`.
-    """
-    if mesh is None:
-        return function
-
-    def partitioned(*args: PyTree) -> PyTree:
-        # The rows of devices are different, which nobody needs to check.
-        split = jax.shard_map(
-            function,
-            mesh=mesh,
-            in_specs=_places(len(args), whole),
-            out_specs=PartitionSpec(AXIS),
-            check_vma=False,
-        )
-        return split(*args)
-
-    return partitioned
-
-
-def side_by_side(
-    function: Callable[[int], T],
-    number: int,
-    threads: int | None = None,
-    stop: Callable[[], None] = lambda: None,
-) -> list[T]:
-    """Calls a function with 0, 1 and so on, in several threads, to use all cores.
-
-    Args:
-      function: of an index.
-      number: of calls.
-      threads: how many calls run at once; all by default.
-      stop: asks the calls to end, when one has failed or Ctrl-C has been pressed.
-
-    Returns:
-      The results, in order.
-    """
-    if number == 1:
-        return [function(0)]
-    with ThreadPoolExecutor(threads or number) as executor:
-        futures = left = [executor.submit(function, i) for i in range(number)]
-        try:
-            while left:
-                # A wait without timeout may not notice Ctrl-C.
-                done, left = wait(left, timeout=0.2)
-                for each in done:
-                    each.result()
-        except BaseException:
-            stop()
-            raise
-        return [future.result() for future in futures]
-
-
-def part(
-    args: tuple[PyTree, ...], i: int, number: int, whole: tuple[int, ...] = ()
-) -> tuple[PyTree, ...]:
-    """The i-th of `number` equal parts of arguments or their shapes, except those at `whole`."""
-    if number == 1:
-        return args
-
-    def cut(x: Row) -> Row:
-        rows = x.shape[0] // number
-        if isinstance(x, jax.ShapeDtypeStruct):
-            return x.update(shape=(rows, *x.shape[1:]))
-        return x[i * rows : (i + 1) * rows]
-
-    return tuple(x if j in whole else jax.tree.map(cut, x) for j, x in enumerate(args))
-
-
-def of_all_parts(shapes: PyTree, number: int) -> PyTree[jax.ShapeDtypeStruct]:
-    """Shapes of the joined results of parts, from those of one part."""
-    if number == 1:
-        return shapes
-    return jax.tree.map(lambda x: x.update(shape=(number * x.shape[0], *x.shape[1:])), shapes)
+def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
+    """Puts values, the same in every process, on every device of a mesh, or on the one device."""
+    return jax.device_put(values) if mesh is None else put(values, places(mesh, 1, whole=1)[0])
 
 
 def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
@@ -291,35 +193,73 @@ def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
     return jax.device_get(values)
 
 
-def joined(
-    run: Callable[[int], PyTree], number: int, threads: int, shapes: PyTree[jax.ShapeDtypeStruct]
-) -> PyTree[np.ndarray]:
-    """Joins the results of `run(0)`, `run(1)` and so on, on the host if there are several.
+def spread(function: Callable[..., PyTree], mesh: Mesh, whole: int = 0) -> Callable[..., PyTree]:
+    """Calls a function on each device with a part of its rows, independent of the other devices.
 
     Args:
-      run: computes the part with an index.
-      number: of parts.
-      threads: how many parts run at once.
-      shapes: of the joined results, see `of_all_parts`.
+      function: of pytrees of arrays, whose first axis is a batch of independent rows. With MJX
+        inside, it must be one that `compilation.trace` returns: jaxlib 0.11.2 crashes while it
+        compiles a step of MJX whose constants `shard_map` sees, on a CPU and on accelerators.
+      mesh: from `make_mesh`; its size must divide the batch.
+      whole: number of arguments, the first ones, that every device gets undivided.
+
+    Returns:
+      The same function; call it under `jit`.
     """
-    if number == 1:
-        return run(0)
-    whole = jax.tree.map(lambda x: _empty(x.shape, x.dtype), shapes)
 
-    def put(i: int) -> None:
-        for rows, new in zip(jax.tree.leaves(whole), jax.tree.leaves(run(i)), strict=True):
-            rows[i * len(new) : (i + 1) * len(new)] = new
+    def partitioned(*args: PyTree) -> PyTree:
+        # The rows of devices are different, which nobody needs to check.
+        split = jax.shard_map(
+            function,
+            mesh=mesh,
+            in_specs=tuple(place.spec for place in places(mesh, len(args), whole)),
+            out_specs=PartitionSpec(AXIS),
+            check_vma=False,
+        )
+        return split(*args)
 
-    side_by_side(put, number, threads)
-    return whole
+    return partitioned
 
 
-def _empty(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+def side_by_side(
+    function: Callable[[T], R],
+    works: Sequence[T],
+    threads: int,
+    fail: Callable[[BaseException], None] = lambda error: None,
+) -> list[R]:
+    """Calls a function for each of some works, in several threads, to use all cores.
+
+    Args:
+      function: of one of them.
+      works: the works.
+      threads: how many calls run at once.
+      fail: asks the calls to end, when one has failed or Ctrl-C has been pressed.
+
+    Returns:
+      The results, in order.
+    """
+    if len(works) == 1:
+        return [function(works[0])]
+    with ThreadPoolExecutor(threads) as executor:
+        futures = left = [executor.submit(function, each) for each in works]
+        try:
+            while left:
+                # A wait without timeout may not notice Ctrl-C.
+                done, left = wait(left, timeout=0.2)
+                for each in done:
+                    each.result()
+        except BaseException as error:
+            fail(error)
+            raise
+        return [future.result() for future in futures]
+
+
+def empty(shape: jax.ShapeDtypeStruct) -> np.ndarray:
     """An array without values that JAX can take over on a CPU, where it would copy others."""
-    size = math.prod(shape) * dtype.itemsize
+    size = math.prod(shape.shape) * shape.dtype.itemsize
     memory = np.empty(size + _ALIGNED, np.uint8)
     first = -memory.ctypes.data % _ALIGNED
-    return memory[first : first + size].view(dtype).reshape(shape)
+    return memory[first : first + size].view(shape.dtype).reshape(shape.shape)
 
 
 def give_back_freed() -> None:

@@ -59,37 +59,34 @@ def runs_long(config: Config, total: int) -> bool:
 class Ledger:
     """Assigns missions to the P x S slots of a batch, whose P parts lie on devices of their own.
 
-    A mission that is done makes room for the next one. The next ones come from a reserve of P x S
-    missions that have begun; each part takes its own in order.
+    A mission that is done makes room for the next one of its part, from a reserve of P x S missions
+    that have begun.
     """
 
     def __init__(self, waiting: Sequence[Int[np.ndarray, " _"]], slots: int):
         """Lets the missions of each of the P parts wait for its S slots."""
-        self._missions, self._slots = waiting, slots
-        self._playing = np.full((len(waiting), slots), -1)
-        self._given = np.zeros(len(waiting), np.int32)  # how many have left the reserve
-        self._reserved_from = np.full(len(waiting), -slots)
-        self._left = sum(map(len, waiting))
+        self._waiting = [missions.tolist() for missions in waiting]
+        self._playing = np.full((len(waiting), slots), -1, np.int32)  # idle slots
+        self._reserve = self._playing.copy()  # missions that are still there
 
     @property
     def is_over(self) -> bool:
         """Whether all missions are done."""
-        return self._left == 0
+        return not any(self._waiting) and max(self._playing.max(), self._reserve.max()) < 0
 
     @property
     def needs_reserve(self) -> bool:
         """Whether missions wait in a part whose reserve is used up."""
-        waits = self._given < [*map(len, self._missions)]
-        return bool(np.any(waits & (self._given == self._reserved_from + self._slots)))
+        parts = zip(self._waiting, self._reserve, strict=True)
+        return any(bool(waiting) and reserve.max() < 0 for waiting, reserve in parts)
 
     def reserve(self) -> Int[np.ndarray, " B"]:
         """Begins a new reserve: `[P * S]` missions. Where a part has fewer, one fills the rest."""
-        self._reserved_from = self._given.copy()
-        rows = np.zeros_like(self._playing, np.int32)
-        for part, (missions, given) in enumerate(zip(self._missions, self._given, strict=True)):
-            some = missions[given : given + self._slots]
-            rows[part, : len(some)] = some
-        return rows.reshape(-1)
+        for waiting, reserve in zip(self._waiting, self._reserve, strict=True):
+            first = [*reserve[reserve >= 0].tolist(), *waiting]
+            some, waiting[:] = first[: len(reserve)], first[len(reserve) :]
+            reserve[:] = some + [-1] * (len(reserve) - len(some))
+        return np.maximum(self._reserve, 0).reshape(-1)
 
     def fill(self) -> Int[np.ndarray, " B"]:
         """Gives idle slots to missions of the reserve.
@@ -98,15 +95,12 @@ class Ledger:
           `[P * S]` index of the mission that each slot takes, within the reserve of its part; -1 if
           the slot keeps its own.
         """
-        taken = np.full_like(self._playing, -1, np.int32)
-        for part, missions in enumerate(self._missions):
-            given, first = self._given[part], self._reserved_from[part]
-            idle = np.flatnonzero(self._playing[part] < 0)
-            idle = idle[: min(first + self._slots, len(missions)) - given]
-            following = given + np.arange(len(idle))
-            taken[part, idle] = following - first
-            self._playing[part, idle] = missions[following]
-            self._given[part] += len(idle)
+        taken = np.full_like(self._playing, -1)
+        for part, (playing, reserve) in enumerate(zip(self._playing, self._reserve, strict=True)):
+            idle, ready = np.flatnonzero(playing < 0), np.flatnonzero(reserve >= 0)
+            number = min(len(idle), len(ready))
+            idle, ready = idle[:number], ready[:number]
+            taken[part, idle], playing[idle], reserve[ready] = ready, reserve[ready], -1
         return taken.reshape(-1)
 
     @property
@@ -117,6 +111,5 @@ class Ledger:
     def end(self, done: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
         """Ends missions in slots that are `done`; returns the slots that are idle from now on."""
         slots = np.flatnonzero(done & (self.playing >= 0))
-        self._playing.reshape(-1)[slots] = -1
-        self._left -= len(slots)
+        self.playing[slots] = -1
         return slots

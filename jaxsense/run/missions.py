@@ -26,7 +26,7 @@ from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
-_STAGE, _BEGIN = "mission", "begin"  # names of the programs in profiles and caches
+_STAGE = "mission"  # name of the programs in profiles and caches
 _SECOND = "naive"  # whose first mission is recorded as well as that of the first case
 _RECORDED = 2  # missions at a time on each device, in its first slots
 
@@ -52,8 +52,8 @@ class Played:
       metrics: `[episodes, ...]` metrics of each case; see `mission.outcome.measure`.
       recording: the first mission of the first case.
       control_steps: total number of control periods, until each mission's end.
-      naive: the same mission under naive exploration; None if it was not played, or if the first
-        worker did not begin it together with the first one.
+      naive: the same mission under naive exploration; None if it was not played, or if there was
+        no slot beside the first one.
     """
 
     metrics: dict[str, Measured]
@@ -127,30 +127,24 @@ class Player:
             default those of the settings.
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
-        config, key = mission.config, jax.random.key(0)
+        config, key, mesh = mission.config, jax.random.key(0), workers.mesh
         batch = max(batch_of(config, total, workers), min(total, _RECORDED * workers.number))
         self._share = -(-batch // workers.number)
+        self._recorded = min(_RECORDED, self._share)
         self.batch = self._share * workers.number
         # Devices of a mesh take each call together; threads take their own.
-        together = Workers(mesh=workers.mesh)
-        rows, long = self._share * together.number, runs_long(config, total)
+        rows, long = self.batch // workers.threads, runs_long(config, total)
         numbers = jax.ShapeDtypeStruct((rows,), jnp.int32)
         faults = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), no_faults(config)
         )
         begun = key, config, jax.eval_shape(lambda: models or init(key, config))
-
-        def compiled(name: str, function: Callable[..., PyTree], *args: PyTree):
-            program = Program(compiler, _STAGE, name)
-            function = functools.partial(function, mission)
-            options = {"runs_long": long, "wide_vectors": long}
-            return program, program.compile(
-                function, *begun, *args, workers=together, whole=(0, 1, 2), **options
-            )
-
-        self._begin, slots = compiled(_BEGIN, _begin, numbers, numbers, faults)
-        go_on = functools.partial(_go_on, min(_RECORDED, self._share))
-        self._go_on, (_, self._found, _) = compiled("go_on", go_on, slots, slots, numbers)
+        options = {"mesh": mesh, "whole": len(begun), "runs_long": long, "wide_vectors": long}
+        self._begin, self._go_on = (Program(compiler, _STAGE, name) for name in ("begin", "go_on"))
+        begin = functools.partial(_begin, mission)
+        slots = self._begin.compile(begin, *begun, numbers, numbers, faults, **options)
+        go_on = functools.partial(_go_on, self._recorded, mission)
+        self._go_on.compile(go_on, *begun, slots, slots, numbers, **options)
 
     def wait(self) -> None:
         """Waits until the programs are compiled."""
@@ -173,123 +167,93 @@ class Player:
         """
         self._monitor.check_finite(_STAGE, "models", models)
         self.wait()
+        config, number, threads = self.mission.config, self._workers.number, self._workers.threads
+        total = episodes * len(played)
+        case, episode = np.divmod(np.arange(total, dtype=np.int32), episodes)
+        of_cases = [(np.int32(each.policy), each.faults) for each in played.values()]
+        missions = episode, *jax.tree.map(lambda *x: np.stack(x)[case], *of_cases)
+        # Missions to record begin in the first slots of the first worker.
+        second = [*played].index(_SECOND) if _SECOND in played else 0
+        recorded = np.unique([0, second * episodes])[: self._recorded]
+        others = np.setdiff1d(np.arange(total), recorded)
+        queues = [others[i::number] for i in range(number)]
+        queues[0] = np.append(recorded, queues[0])
+        lock, done = threading.Lock(), [0]
+
+        def end(some: int) -> None:
+            with lock:  # so that no thread reports fewer than another one before it
+                done[0] += some
+                self._monitor.progress(_STAGE, done[0], total)
+
         with self._monitor.stopwatch.measure("run_s", _STAGE):
             # Loaded models lie on the host, and every chunk would transfer them again.
-            models = devices.put_everywhere(models, self._workers.mesh)
-            call = _Call(key, models, played, episodes, self._found.metrics)
-            play = functools.partial(self._play, call)
-            devices.side_by_side(play, self._workers.threads, stop=call.stopped.set)
-            return call.result()
+            given = key, config, devices.put_everywhere(models, self._workers.mesh)
+            play = functools.partial(self._play, given, missions, recorded, end)
+            lanes = [queues[i::threads] for i in range(threads)]
+            results = devices.side_by_side(play, lanes, threads, fail=self._monitor.fail)
+        ended = [each for of_lane, _ in results for each in of_lane]
+        numbers, found = jax.tree.map(lambda *x: np.concatenate(x), *ended)
+        found = _rows(found, np.argsort(numbers))
+        metrics = {
+            name: _rows(found.metrics, slice(i * episodes, (i + 1) * episodes))
+            for i, name in enumerate(played)
+        }
+        recording, *naive = results[0][1]
+        return Played(metrics, recording, int(found.steps.sum()), *naive)
 
-    def _play(self, call: "_Call", lane: int) -> None:
-        """Plays the missions of one of the threads."""
-        config, parts = self.mission.config, self._workers.number // self._workers.threads
-        missions = call.order(self._workers.number)
-        ledger = Ledger(
-            [missions[lane * parts + p :: self._workers.number] for p in range(parts)], self._share
-        )
+    def _play(
+        self,
+        given: tuple[Key, Config, Models],
+        missions: tuple[PyTree[np.ndarray], ...],
+        recorded: Int[np.ndarray, " K"],
+        end: Callable[[int], None],
+        queues: list[Int[np.ndarray, " _"]],
+    ) -> tuple[list[tuple[np.ndarray, _Found]], list[Recording]]:
+        """Plays the missions in the queues of one of the threads.
+
+        Args:
+          given: what all calls of the programs take first.
+          missions: `[E]` episode, policy and faults of each.
+          recorded: missions to record, the first ones of the first queue.
+          end: receives the number of missions that have ended.
+          queues: of each device of the thread.
+
+        Returns:
+          Missions that have ended at the same time with what was found of them, and recordings.
+        """
+        ledger, ended = Ledger(queues, self._share), list[tuple[np.ndarray, _Found]]()
         slots: _Slots | None = None
         reserve: _Slots | None = None
-        while not ledger.is_over and not call.stopped.is_set():
+        chunks = [list[Recording]() for each in recorded if each in queues[0]]
+        while not ledger.is_over:
             self._monitor.check_stop()
             if ledger.needs_reserve:
-                begun = call.begins(ledger.reserve())
-                reserve = self._begin.run(call.key, config, call.models, *begun)
+                reserve = self._begin.run(*given, *_rows(missions, ledger.reserve()))
             slots, taken = reserve if slots is None else slots, ledger.fill()
-            slots, found, first = self._go_on.run(
-                call.key, config, call.models, slots, reserve, taken
-            )
+            slots, found, first = self._go_on.run(*given, slots, reserve, taken)
             found, playing = devices.fetched(found), ledger.playing.copy()
-            self._check(call, playing, found)
-            if lane == 0:
-                call.record(playing, first)
-            ended = ledger.end(found.done)
-            call.end(playing[ended], _rows(found, ended), self._monitor.progress)
+            self._check(playing, missions[1], found)
+            if due := [i for i, chunk in enumerate(chunks) if playing[i] == recorded[i]]:
+                fetched = devices.fetched(first)
+                for i in due:
+                    chunks[i].append(_rows(fetched, i))
+            over = ledger.end(found.done)
+            ended.append((playing[over], _rows(found, over)))
+            end(len(over))
+        return ended, [*map(_whole, chunks)]
 
-    def _check(self, call: "_Call", playing: Int[np.ndarray, " B"], found: _Found) -> None:
+    def _check(
+        self, playing: Int[np.ndarray, " B"], policies: Int[np.ndarray, " E"], found: _Found
+    ) -> None:
         """Raises `StageError` if beliefs or values of a policy were not finite in a mission."""
         for slot in np.flatnonzero((playing >= 0) & ~(found.is_finite & found.has_values)):
             what = f"beliefs after {found.chunks[slot]} chunks"
             if found.is_finite[slot]:
-                what = f"values of policy {[*self.mission.policies][call.policies[playing[slot]]]}"
+                what = f"values of policy {[*self.mission.policies][policies[playing[slot]]]}"
             raise StageError(f"{_STAGE}: {what} are not finite")
 
 
-class _Call:
-    """The missions of one call of `Player.play`, case by case, and what was found of them."""
-
-    def __init__(
-        self,
-        key: Key,
-        models: Models,
-        played: dict[str, Case],
-        episodes: int,
-        metrics: PyTree[jax.ShapeDtypeStruct],
-    ):
-        self.key, self.models, self.stopped = key, models, threading.Event()
-        self._cases, self._episodes, self._total = [*played], episodes, episodes * len(played)
-        self._done = self._control_steps = 0
-        case = np.arange(self._total) // episodes
-        self.policies = np.array([each.policy for each in played.values()], np.int32)[case]
-        faults = [each.faults for each in played.values()]
-        self._faults: Faults = jax.tree.map(lambda *x: np.stack(x)[case], *faults)
-        self._metrics = jax.tree.map(
-            lambda x: np.zeros((self._total, *x.shape[1:]), x.dtype), metrics
-        )
-        second = [*played].index(_SECOND) if _SECOND in played else 0
-        self._wanted = (0, second * episodes) if second else (0,)
-        self._recorded = [list[Recording]() for _ in self._wanted]
-        self._lock = threading.Lock()
-
-    def order(self, stride: int) -> Int[np.ndarray, " E"]:
-        """All missions; in a list of every `stride`-th one, those to record come first."""
-        missions = np.arange(self._total, dtype=np.int32)
-        for i, mission in enumerate(self._wanted):
-            if i * stride < self._total:
-                missions[[i * stride, mission]] = missions[[mission, i * stride]]
-        return missions
-
-    def begins(self, missions: Int[np.ndarray, " B"]) -> tuple[np.ndarray, np.ndarray, Faults]:
-        """Episodes, policies and faults of missions."""
-        return missions % self._episodes, self.policies[missions], _rows(self._faults, missions)
-
-    def record(self, playing: Int[np.ndarray, " B"], first: Recording) -> None:
-        """Keeps a chunk of missions to record, of which `[K]` are in a device's first slots."""
-        wanted = enumerate(self._wanted[: len(first.end.done)])
-        if due := [i for i, mission in wanted if playing[i] == mission]:
-            fetched = devices.fetched(first)
-            for i in due:
-                self._recorded[i].append(_rows(fetched, i))
-
-    def end(
-        self,
-        missions: Int[np.ndarray, " E"],
-        found: _Found,
-        report: Callable[[str, int, int], None],
-    ) -> None:
-        """Keeps the results of missions that are done, and reports their number and that of all."""
-
-        def put(rows: np.ndarray, new: np.ndarray) -> None:
-            rows[missions] = new
-
-        jax.tree.map(put, self._metrics, found.metrics)
-        with self._lock:
-            self._done += len(missions)
-            self._control_steps += int(found.steps.sum())
-            # Here, so that no lane reports fewer than another one before it.
-            report(_STAGE, self._done, self._total)
-
-    def result(self) -> Played:
-        """The results of all missions, which must be done."""
-        rows = np.arange(self._total).reshape(-1, self._episodes)
-        metrics = {
-            name: _rows(self._metrics, each) for name, each in zip(self._cases, rows, strict=True)
-        }
-        recording, *others = (_whole(chunks) for chunks in self._recorded if chunks)
-        return Played(metrics, recording, self._control_steps, *others)
-
-
-def _rows(values: PyTree, rows: int | np.ndarray) -> PyTree[np.ndarray]:
+def _rows(values: PyTree, rows: int | slice | np.ndarray) -> PyTree[np.ndarray]:
     """Copies some rows of arrays."""
     return jax.tree.map(lambda x: np.array(x[rows]), values)
 

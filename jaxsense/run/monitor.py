@@ -82,14 +82,14 @@ class Monitor:
 
     def begin(self, listener: Listener) -> None:
         """Begins another run: forgets a failure and replaces the listener."""
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None
         self._listener = listener
 
     def stop(self) -> None:
         """Asks the stages to save their training and stop."""
         self._stop.set()
 
-    def fail(self, failure: Exception) -> None:
+    def fail(self, failure: BaseException) -> None:
         """Stops the stages that run concurrently with a failed one."""
         self._failure = failure
 

@@ -15,9 +15,8 @@ from jaxsense.mission.outcome import require_playable
 from jaxsense.models import Models
 from jaxsense.run import missions
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.compilation import Compiler
+from jaxsense.run.compilation import Compiler, Kept
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.kept import Kept
 from jaxsense.run.loop import Trained, train
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import OwnPolicies, Programs

@@ -4,7 +4,6 @@ A thread traces them one after the other. Each compiles as soon as it is traced,
 compiled programs already run. Shapes come from tracing: a stage's outputs are later stages' inputs.
 """
 
-import dataclasses
 import threading
 from collections import Counter
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import Policy, Values
 from jaxsense.run import missions
-from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.compilation import Compiler, Program, RowProgram
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.sim.world import make_world
 from jaxsense.training import stages
@@ -29,7 +28,6 @@ OwnPolicies = Mapping[str, Values | Policy]
 """Policies of a user, by name, see `dqn.policies.table`."""
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for
-_ROWS_AT_ONCE = 512  # of each thread; their results take up little memory besides those of all
 _HAS_ROWS = ("survey",)  # whose inputs and outputs are independent rows, which workers share
 # The newer code generator of a CPU trains a JMVAE a tenth faster, other networks a twentieth at
 # most, and takes half as long again and four times the memory to compile.
@@ -46,9 +44,11 @@ class Shapes(NamedTuple):
 class StagePrograms:
     """The programs of a stage, see `Stage`; `shapes` are known once they are traced."""
 
-    def __init__(self, compiler: Compiler, name: str):
+    def __init__(self, compiler: Compiler, name: str, workers: Workers):
         self._all = [Program(compiler, name, part) for part in ("begin", "advance", "finish")]
         self.begin, self.advance, self.finish = self._all
+        if name in _HAS_ROWS and (_on_cpu() or workers.mesh is not None):
+            self.begin = RowProgram(self.begin, workers)
         self.shapes: Future[Shapes] = Future()
 
     def fail(self, error: BaseException) -> None:
@@ -89,7 +89,7 @@ class Programs:
         self.player: Future[missions.Player] = Future()
         self._compiler, self._workers, self._policies = compiler, workers, policies
         names = [stage.program for stage in self.stages]
-        self._of = {name: StagePrograms(compiler, name) for name in names}
+        self._of = {name: StagePrograms(compiler, name, workers) for name in names}
         self._left, self._lock = Counter(trainings * names), threading.Lock()
         threading.Thread(target=self._trace, name="trace").start()
 
@@ -145,8 +145,7 @@ class Programs:
         def finish(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
             return stage.finish(config, state, **inputs)
 
-        workers = _workers_for(inputs, self._workers) if stage.name in _HAS_ROWS else ALONE
-        state = compiled.begin.compile(begin, key, config, inputs, workers=workers, whole=(0, 1))
+        state = compiled.begin.compile(begin, key, config, inputs, whole=2)
         if (step := stage.advance) is None:
             shapes = Shapes(jax.eval_shape(lambda *args: finish(config, *args), state, inputs))
         else:
@@ -169,11 +168,3 @@ class Programs:
 def _on_cpu() -> bool:
     """Whether the programs run on a CPU; accelerators train faster than they compile."""
     return jax.default_backend() == "cpu"
-
-
-def _workers_for(inputs: Output, workers: Workers) -> Workers:
-    """Workers for rows: threads take a few of them at a time, devices all at once."""
-    if not _on_cpu() or workers.mesh is not None:
-        return workers
-    rows = len(jax.tree.leaves(inputs)[0])
-    return dataclasses.replace(workers, calls=-(-rows // (workers.threads * _ROWS_AT_ONCE)))
