@@ -15,7 +15,7 @@ import pytest
 from jaxsense.config import ConfigError
 from jaxsense.core.supervised import FitState
 from jaxsense.run import files
-from jaxsense.run.checkpoints import Checkpoints, Unfinished
+from jaxsense.run.checkpoints import UNFINISHED, Checkpoints
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))
@@ -140,13 +140,6 @@ def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
         np.testing.assert_array_equal(here, there)
 
 
-def test_without_a_directory_nothing_is_saved():
-    checkpoints = Checkpoints()
-    checkpoints.save("tree", TREE)
-    checkpoints.forget_unfinished(["jmvae"])
-    assert checkpoints.load("tree", SHAPES) is None
-
-
 DAMAGES = {
     "flipped bit": lambda content, i: content[:i] + bytes([content[i] ^ 4]) + content[i + 1 :],
     "truncated": lambda content, i: content[:i],
@@ -191,17 +184,13 @@ def test_a_checkpoint_of_other_shapes_is_named(tmp_path, shapes, expected):
 
 
 def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path):
-    checkpoints = Checkpoints(tmp_path, pytest.fail)
+    checkpoints, name = Checkpoints(tmp_path, pytest.fail), f"{UNFINISHED}/jmvae"
     state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7), np.float32(0.5))]
-    saved = Unfinished(2, state, {"loss": [1.5, float("nan")], "none": []})
-    checkpoints.save_unfinished("jmvae", saved)
+    checkpoints.save(name, state)
     checkpoints.save("tree", TREE)
-    done, found, curves = checkpoints.load_unfinished("jmvae", state, 3)
-    assert done == 2
-    assert isinstance(found[0], FitState)
-    np.testing.assert_array_equal(found[0].params["w"], [1, 1])
-    np.testing.assert_array_equal(curves["loss"], [1.5, np.nan])
-    assert curves["none"] == []
+    (found,) = checkpoints.load(name, state)
+    assert isinstance(found, FitState)
+    np.testing.assert_array_equal(found.params["w"], [1, 1])
     theirs = tmp_path / "unfinished" / "theirs.msgpack"
     theirs.write_text("precious")
     checkpoints.forget_unfinished(["jmvae"])
@@ -209,5 +198,5 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     theirs.unlink()
     checkpoints.forget_unfinished(["jmvae"])
     assert not (tmp_path / "unfinished").exists()
-    assert checkpoints.load_unfinished("jmvae", state, 3) is None
+    assert checkpoints.load(name, state) is None
     assert checkpoints.load("tree", SHAPES) is not None

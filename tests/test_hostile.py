@@ -19,7 +19,6 @@ from summaries import CASE, EVALUATION, RESULTS, SUMMARY
 import jaxsense
 from jaxsense import evaluate, models, summary
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.run.checkpoints import Unfinished
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.summary import compare
@@ -36,8 +35,8 @@ pytestmark = [
 CONFIG = PRESETS["smoke"]
 STATE = {"w": np.ones(3, np.float32)}
 SPARSE = 2**30  # bytes
-CHUNKS = 4
-WHOLE = {"loss": [0.0] * 10, "seconds": [0.0] * CHUNKS}  # chunks of 3, 3, 3 and 1
+CURVES = {"loss": np.ones(10, np.float32), "seconds": np.ones(4, np.float32)}
+TRAINING = {"state": STATE, "curves": CURVES}
 
 
 @functools.cache
@@ -51,8 +50,7 @@ def base(tmp_path_factory):
     path = tmp_path_factory.mktemp("base") / "run"
     with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as run:
         save_models(run, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes()))
-        curves = {"loss": [1.0] * 6, "seconds": [0.1] * 2}
-        run.checkpoints.save_unfinished("dqn_camera", Unfinished(2, STATE, curves))
+        run.checkpoints.save("unfinished/dqn_camera", TRAINING)
         run.append_metrics(stage="jmvae", step=1, loss=0.5)
     (path / "summary.json").write_text(json.dumps(SUMMARY))
     (path / "evaluations").mkdir()
@@ -77,8 +75,8 @@ def resume(path):
     shutil.rmtree(file) if file.is_dir() else file.unlink()
     with RunDirectory.resume(path) as run:
         run.checkpoints.load_or_forget("best_jmvae", shapes().jmvae, finite=True)
-        run.checkpoints.load_unfinished("dqn_camera", STATE, CHUNKS, WHOLE)
-        run.checkpoints.save_unfinished("dqn_camera", Unfinished(1, STATE, WHOLE))
+        run.checkpoints.load_or_forget("unfinished/dqn_camera", TRAINING)
+        run.checkpoints.save("unfinished/dqn_camera", TRAINING)
         run.append_metrics(stage="jmvae", step=2, loss=0.5)
         run.checkpoints.forget_unfinished(["dqn_camera"])
 
@@ -138,8 +136,7 @@ def digested(name, content):
 
 def unfinished(**changed):
     """The training under way, of which some parts are others."""
-    found = {"done": 2, "state": STATE, "curves": {"loss": np.ones(6), "seconds": np.ones(2)}}
-    return digested("unfinished/dqn_camera", found | changed)
+    return digested("unfinished/dqn_camera", TRAINING | changed)
 
 
 def edited(name, **changed):
@@ -182,8 +179,8 @@ CASES = {
     "model deep": (digested("best_jmvae", b"\x81\xa1a" * 1000 + b"\x01"), DAMAGED),
     "model of 2^32 items": (digested("best_jmvae", b"\xdd\xff\xff\xff\xff"), DAMAGED),
     "model NaN": (poisoned, NOT_NUMBERS),
-    "done 1e9": (unfinished(done=10**9), "done = 1000000000: must be from 0 to 4"),
-    "curves none": (unfinished(curves={}), "its curves have other names or lengths"),
+    "curves none": (unfinished(curves={}), "it holds other arrays"),
+    "curves long": (unfinished(curves=CURVES | {"seconds": np.ones(9, np.float32)}), DAMAGED),
     "state": (unfinished(state={"w": np.ones(4, np.float32)}), "in place of float32(3,)"),
     "no digest": (
         edited("config.json", digest=None, seed=7),

@@ -1,20 +1,23 @@
-"""The loop that drives the stages of a training from the host."""
+"""The stages of a training, driven from the host."""
 
 import gc
+import tempfile
 import time
 import weakref
+from pathlib import Path
 from types import SimpleNamespace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS
-from jaxsense.run import devices, loop, pipeline, programs
+from jaxsense.run import devices, pipeline, programs
 from jaxsense.run.checkpoints import Checkpoints
-from jaxsense.run.loop import run_chunks
 from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.pipeline import run_chunks
 from jaxsense.run.programs import Programs
 from jaxsense.training import stages
 from jaxsense.training.stage import Progress, Stage
@@ -51,9 +54,10 @@ def toy(replace_training, tmp_path):
         replace_training(toy_training)
         heard, warned = [], []
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
-        checkpoints = Checkpoints(tmp_path if saved else None, warned.append)
+        path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
+        checkpoints = Checkpoints(path, warned.append)
         with pipeline.compiled(SMOKE, monitor) as compiled:
-            found = loop.train(KEY, SMOKE, compiled, monitor, checkpoints)
+            found = pipeline.train(KEY, SMOKE, compiled, monitor, checkpoints)
         return found, [report for report in heard if report[2]], warned
 
     return train
@@ -119,7 +123,7 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect
         for name in ("second", "third", "fourth"):
             x = drive(Stage(name, lambda key, config, x: 2 * x), x=x)
 
-    begun, alive, begin = {}, {}, loop._Loop._begin
+    begun, alive, begin = {}, {}, pipeline._Training._begin
 
     def watched(self, stage, inputs):
         time.sleep(0.5)  # it is noticed from time to time that a stage is done
@@ -129,7 +133,7 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect
         begun[stage.name] = weakref.ref(output)
         return output
 
-    monkeypatch.setattr(loop._Loop, "_begin", watched)
+    monkeypatch.setattr(pipeline._Training, "_begin", watched)
     found, _, _ = toy(train)
     assert alive["second"] == ["scenes"]
     assert alive["fourth"] == ["second", "third"]
@@ -137,7 +141,7 @@ def test_what_is_only_passed_on_is_held_no_longer_than_it_is_needed(toy, collect
     np.testing.assert_array_equal(found.outputs["fourth"], [8, 8, 8])
 
 
-def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_training):
+def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_training, tmp_path):
     # Stages of one kind share their programs.
     names = "dqn_camera", "dqn_lidar"
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
@@ -148,9 +152,9 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_tra
         assert shared is compiled.of(kinds[1])
         every = [shared.advance, compiled.of(kinds[2]).finish]
         alive = [weakref.ref(program.wait()) for program in every]
-        loop.train(KEY, SMOKE, compiled, monitor)
+        pipeline.train(KEY, SMOKE, compiled, monitor, Checkpoints(tmp_path / "first"))
         assert all(program() is not None for program in alive)
-        loop.train(KEY, SMOKE, compiled, monitor)
+        pipeline.train(KEY, SMOKE, compiled, monitor, Checkpoints(tmp_path / "second"))
         collect()
         assert all(program() is None for program in alive)
         with pytest.raises(RuntimeError, match="advance of dqn was released"):
@@ -166,7 +170,7 @@ def test_rows_are_the_same_in_parts(toy, monkeypatch, number):
         return side_by_side(function, works, *rest)
 
     monkeypatch.setattr(devices, "side_by_side", counted)
-    monkeypatch.setattr(loop, "_ONLY_PASSED_ON", ())
+    monkeypatch.setattr(pipeline, "_ONLY_PASSED_ON", ())
     first = Stage("first", lambda key, config: jnp.arange(2.0 * number).reshape(number, 2))
     survey = Stage("survey", lambda key, config, x: (x + 1, x.sum(axis=1)))
     found, _, _ = toy(lambda drive: drive(survey, x=drive(first)))
@@ -220,7 +224,7 @@ def test_a_training_that_is_not_finite_ends_what_follows_from_it(toy):
 
 
 def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
-    begin = loop._Loop._begin
+    begin = pipeline._Training._begin
 
     def fails_or_waits(self, stage, inputs):
         if stage.name == "full":
@@ -231,9 +235,18 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
             time.sleep(0.01)
         raise AssertionError("it was not stopped")
 
-    monkeypatch.setattr(loop._Loop, "_begin", fails_or_waits)
+    monkeypatch.setattr(pipeline._Training, "_begin", fails_or_waits)
     with pytest.raises(OSError, match="No space left"):
         toy(lambda drive: (count(drive), drive(Stage("full", lambda key, config: jnp.zeros(2)))))
+
+
+def curves(chunks, done=0):
+    """Chunks count themselves, and take a second."""
+    count = np.arange(chunks, dtype=np.float32)
+    return {
+        "chunk": np.where(count < done, count, np.nan),
+        "seconds": np.where(count < done, 1, np.nan),
+    }
 
 
 def go_on(path, chunks, run, monitor=None):
@@ -241,14 +254,23 @@ def go_on(path, chunks, run, monitor=None):
 
     def counted(chunk, state):
         run(chunk)
-        return state + 1, {"chunk": [chunk]}
+        return state + 1, {"chunk": [chunk], "seconds": [1.0]}
 
     stage = Stage("jmvae", lambda key, config: (), chunks=chunks)
-    return run_chunks(stage, np.float32(0), counted, monitor or Monitor(), Checkpoints(path))
+    none, checkpoints = curves(chunks), Checkpoints(path)
+    return run_chunks(stage, np.float32(0), none, counted, monitor or Monitor(), checkpoints)
 
 
-def saved(path, chunks):
-    return Checkpoints(path).load_unfinished("jmvae", np.float32(0), chunks)
+def check(found, chunks, done):
+    """A state and curves are those after some chunks."""
+    chex.assert_trees_all_equal(found, (np.float32(done), curves(chunks, done)))
+
+
+def check_saved(path, chunks, done):
+    """A training was saved after some chunks."""
+    shapes = {"state": np.float32(0), "curves": curves(chunks)}
+    found = Checkpoints(path).load("unfinished/jmvae", shapes)
+    check((found["state"], found["curves"]), chunks, done)
 
 
 def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
@@ -259,12 +281,12 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
 
     with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
         go_on(tmp_path, 4, run)
-    assert saved(tmp_path, 4) == (2, 2, {"chunk": [0, 1]})
+    check_saved(tmp_path, 4, done=2)
 
 
 def test_a_killed_training_loses_no_more_than_a_minute(tmp_path, monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(pipeline, "time", SimpleNamespace(monotonic=lambda: clock[0]))
 
     def run(chunk):
         clock[0] += 25.0
@@ -274,18 +296,19 @@ def test_a_killed_training_loses_no_more_than_a_minute(tmp_path, monkeypatch):
     # Five chunks of 25 s: it is saved after 75 s, and would be after 150 s.
     with pytest.raises(KeyboardInterrupt):
         go_on(tmp_path, 9, run)
-    assert saved(tmp_path, 9) == (3, 3, {"chunk": [0, 1, 2]})
+    check_saved(tmp_path, 9, done=3)
 
 
 def test_a_stop_is_heard_after_every_chunk_and_what_is_over_is_saved(tmp_path):
     monitor = Monitor()
     with pytest.raises(Stopped):
         go_on(tmp_path, 4, lambda chunk: chunk == 1 and monitor.stop(), monitor)
-    assert saved(tmp_path, 4) == (2, 2, {"chunk": [0, 1]})
-    chunks = []
-    assert go_on(tmp_path, 3, chunks.append, monitor) == (3, {"chunk": [0, 1, 2]})
-    assert chunks == [2]
-    assert go_on(tmp_path, 3, lambda chunk: pytest.fail("trained again"))[0] == 3
+    check_saved(tmp_path, 4, done=2)
+    chunks, again = [], Monitor()
+    last = lambda chunk: (chunks.append(chunk), chunk == 3 and again.stop())  # noqa: E731
+    check(go_on(tmp_path, 4, last, again), 4, done=4)
+    assert chunks == [2, 3]
+    check(go_on(tmp_path, 4, lambda chunk: pytest.fail("trained again")), 4, done=4)
 
 
 def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
@@ -293,6 +316,6 @@ def test_a_training_that_fails_ends_what_goes_on_beside_it(tmp_path):
     fail = lambda chunk: monitor.fail(StageError("dqn_lidar: loss = nan"))  # noqa: E731
     with pytest.raises(StageError, match="dqn_lidar"):
         go_on(tmp_path, 9, fail, monitor)
-    assert saved(tmp_path, 9)[:2] == (1, 1)
+    check_saved(tmp_path, 9, done=1)
     monitor.begin(lambda *_: None)  # the next seed
     monitor.check_stop()

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -22,30 +22,14 @@ from jaxsense.run.monitor import is_finite
 
 T = TypeVar("T")
 
-Curves = dict[str, list[float]]
-"""Metrics of a training so far, by name."""
-
 _SUFFIX = ".msgpack"
-_UNFINISHED = "unfinished"
+UNFINISHED = "unfinished"
+"""The directory of unfinished trainings in that of checkpoints."""
 _REST = 2**20  # bytes of a checkpoint that are not numbers
 
 
-class Unfinished(NamedTuple):
-    """An unfinished training.
-
-    Attributes:
-      done: number of chunks so far.
-      state: input of the next chunk.
-      curves: metrics of the chunks so far.
-    """
-
-    done: int
-    state: PyTree
-    curves: Curves
-
-
 class Checkpoints:
-    """Checkpoints of a run in a directory; without one, saves and finds none.
+    """Checkpoints of a run in a directory.
 
     A damaged checkpoint is set aside and its content is trained again, with the same result, since
     seed and settings determine a run.
@@ -56,7 +40,7 @@ class Checkpoints:
 
     def __init__(
         self,
-        path: Path | None = None,
+        path: Path,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
         saved: Callable[[str], object] = lambda name: None,
     ):
@@ -72,8 +56,6 @@ class Checkpoints:
 
     def save(self, name: str, tree: PyTree) -> None:
         """Saves a pytree of arrays; raises `OSError` if the file cannot be written."""
-        if self.path is None:
-            return
         file, tree = self._file(name), jax.tree.map(np.asarray, tree)
         file.parent.mkdir(parents=True, exist_ok=True)
         content = serialization.msgpack_serialize(serialization.to_state_dict(tree))
@@ -95,64 +77,10 @@ class Checkpoints:
         Raises:
           ConfigError: if the file is damaged or holds arrays of other shapes.
         """
-        return self._load(name, shapes, lambda found: _like(shapes, found, finite))
-
-    def load_or_forget(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
-        """As `load`, but warns and sets the file aside if it cannot be used, and returns None."""
-        return self._or_forget(name, lambda: self.load(name, shapes, finite))
-
-    def save_unfinished(self, stage: str, unfinished: Unfinished) -> None:
-        """Saves an unfinished training over its previous checkpoint; raises as `save` does."""
-        curves = {name: np.array(values, np.float64) for name, values in unfinished.curves.items()}
-        saved = {"done": np.int64(unfinished.done), "state": unfinished.state, "curves": curves}
-        self.save(f"{_UNFINISHED}/{stage}", saved)
-
-    def load_unfinished(
-        self, stage: str, state: PyTree, chunks: int, whole: Curves | None = None
-    ) -> Unfinished | None:
-        """Loads an unfinished training.
-
-        Args:
-          stage: its name.
-          state: any state of it, for structure and shapes.
-          chunks: number of chunks of the whole training.
-          whole: any curves of the whole training, for names and lengths; not checked without.
-
-        Returns:
-          The training as last saved; None if there is none, or its file is damaged.
-        """
-
-        def restore(found: PyTree) -> Unfinished:
-            curves = {name: values.tolist() for name, values in found["curves"].items()}
-            done, sizes = int(found["done"]), {name: len(x) for name, x in curves.items()}
-            if not 0 <= done <= chunks:
-                raise ValueError(f"done = {done}: must be from 0 to {chunks}")
-            # Only the last of all chunks may be smaller.
-            due = {n: min(done * -(-len(x) // chunks), len(x)) for n, x in (whole or {}).items()}
-            if whole is not None and sizes != due:
-                raise ValueError("its curves have other names or lengths")
-            return Unfinished(done, _like(state, found["state"]), curves)
-
-        name = f"{_UNFINISHED}/{stage}"
-        return self._or_forget(name, lambda: self._load(name, (state, whole), restore))
-
-    def forget_unfinished(self, stages: Iterable[str]) -> None:
-        """Removes the checkpoints of unfinished trainings of stages; files of others stay."""
-        if self.path is None:
-            return
-        with contextlib.suppress(OSError):
-            for stage in stages:
-                self._file(f"{_UNFINISHED}/{stage}").unlink(missing_ok=True)
-            (self.path / _UNFINISHED).rmdir()
-
-    def _load(self, name: str, shapes: PyTree, restore: Callable[[PyTree], T]) -> T | None:
-        """Applies `restore` to the content of a checkpoint of such arrays; see `load`."""
-        if self.path is None:
-            return None
-        most = _REST + 8 * sum(getattr(x, "size", 1) for x in jax.tree.leaves(shapes))
+        most = _REST + 8 * sum(x.size for x in jax.tree.leaves(shapes))
         try:
             content = files.without_digest(inside.read(self._file(name), most))
-            return restore(serialization.msgpack_restore(content))
+            return _like(shapes, serialization.msgpack_restore(content), finite)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -162,19 +90,25 @@ class Checkpoints:
             reason = f"is damaged or of other settings ({first})"
         raise ConfigError("checkpoint", f"{self.path}/{name}{_SUFFIX}", reason)
 
-    def _or_forget(self, name: str, load: Callable[[], T | None]) -> T | None:
-        """What `load` returns; see `load_or_forget`."""
+    def load_or_forget(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
+        """As `load`, but warns and sets the file aside if it cannot be used, and returns None."""
         try:
-            return load()
+            return self.load(name, shapes, finite)
         except ConfigError as error:
             file = self._file(name)
             file.replace(file.with_name(f"{file.name}.damaged"))
             self._warn(f"{error}; retraining it")
             return None
 
+    def forget_unfinished(self, stages: Iterable[str]) -> None:
+        """Removes the checkpoints of unfinished trainings of stages; files of others stay."""
+        with contextlib.suppress(OSError):
+            for stage in stages:
+                self._file(f"{UNFINISHED}/{stage}").unlink(missing_ok=True)
+            (self.path / UNFINISHED).rmdir()
+
     def _file(self, name: str) -> Path:
         """The file of a checkpoint, which may be a link; raises `OSError` if it is elsewhere."""
-        assert self.path is not None
         file = self.path / f"{name}{_SUFFIX}"
         return inside.place(file.parent, self.path.parent) / file.name
 

@@ -1,11 +1,14 @@
-"""A whole run: the training, the missions, and the summary of both."""
+"""A whole run: trains stage after stage, plays the missions, and summarises both."""
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense import mission, summary
 from jaxsense.config import Config
@@ -13,18 +16,34 @@ from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
 from jaxsense.mission.outcome import require_playable
 from jaxsense.models import Models
-from jaxsense.run import missions
-from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run import devices, missions
+from jaxsense.run.checkpoints import UNFINISHED, Checkpoints
 from jaxsense.run.compilation import Compiler, Kept
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.loop import Trained, train
-from jaxsense.run.monitor import Monitor
+from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.summary import compare
+from jaxsense.training import stages
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
 from jaxsense.training.measures import reliability
-from jaxsense.training.stages import mission_key, models
+from jaxsense.training.stage import Output, Progress, Stage
+
+Curves = dict[str, np.ndarray]
+"""`[steps]` of each metric of a training, and `[chunks]` `seconds`; NaN where it has not been."""
+
+_SAVE_PERIOD = 60.0  # s
+_MAX_THREADS = 64  # stages that run or wait at once
+_ONLY_PASSED_ON = ("scenes", "survey", "examples", "views")  # let go of once no stage needs them
+_SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # beside trainings
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """Outputs and curves of stages."""
+
+    outputs: dict[str, Output]
+    curves: dict[str, Curves]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,9 +112,9 @@ def learn(
     config: Config,
     programs: Programs,
     monitor: Monitor,
-    checkpoints: Checkpoints | None = None,
+    checkpoints: Checkpoints,
 ) -> Learned:
-    """Trains everything and summarises it; see `loop.train`."""
+    """Trains everything and summarises it; see `train`."""
     trained = train(key, config, programs, monitor, checkpoints)
     scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
@@ -105,7 +124,7 @@ def learn(
     # Measured of a JMVAE that learns from scans, and of no other.
     grouped = {name: x for name, x in trained.outputs.items() if name == "grouped"}
     return Learned(
-        models=models(trained.outputs, config),
+        models=stages.models(trained.outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
             for sensor, windows in zip(scenario.world.sensors, detections.windows, strict=True)
@@ -115,7 +134,7 @@ def learn(
         posteriors=posteriors,
         rewards={
             network.removeprefix("dqn_"): {
-                name: np.array(trained.curves[network][name]) for name in ("reward", "evaluation")
+                name: trained.curves[network][name] for name in ("reward", "evaluation")
             }
             for network in (learner(config, n) for n in config.modalities)
         },
@@ -135,7 +154,7 @@ def play(
     config: Config,
     programs: Programs,
     learned: Learned,
-    checkpoints: Checkpoints | None = None,
+    checkpoints: Checkpoints,
 ) -> Played:
     """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 
@@ -145,8 +164,8 @@ def play(
     player, episodes = programs.player.result(), config.mission.episodes
     cases = mission.cases(config, player.mission.policies)
     played = {name: cases[name] for name in config.mission.policies}
-    found = player.play(mission_key(key), learned.models, played, episodes)
-    (checkpoints or Checkpoints()).forget_unfinished(stage.name for stage in programs.stages)
+    found = player.play(stages.mission_key(key), learned.models, played, episodes)
+    checkpoints.forget_unfinished(stage.name for stage in programs.stages)
     block = summary.missions(player.mission, found.metrics)
     return Played(found.recording, found.naive, block)
 
@@ -160,7 +179,222 @@ def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> s
         config,
         rewards,
         permutations(config),
-        trained.curves[learner(config, modality)]["seconds"],
+        trained.curves[learner(config, modality)]["seconds"].tolist(),
         dict(zip(config.evaluation.num_pois, others, strict=True)),
         has_optimum(fusion, values[config.modalities.index(modality)], is_sound),
     )
+
+
+def train(
+    key: Key, config: Config, programs: Programs, monitor: Monitor, checkpoints: Checkpoints
+) -> Trained:
+    """Runs all stages; independent ones run side by side.
+
+    Args:
+      key: the only source of randomness.
+      config: all settings; its `Traced` fields are inputs of the programs.
+      programs: of the stages.
+      monitor: receives time and progress.
+      checkpoints: where to save. Stages found there, which must come from the same key and
+        settings, are not trained again.
+
+    Raises:
+      StageError: if a loss, parameter or result is not finite; trainings under way are saved as
+        they were before.
+      Stopped: if the monitor was asked to stop; trainings under way are saved.
+      OSError: if a checkpoint cannot be written.
+    """
+    training = _Training(key, config, programs, monitor, checkpoints)
+    outputs = dict[str, Future[Output]]()
+    with ThreadPoolExecutor(_MAX_THREADS, "stage") as threads:
+        running = set[Future[None]]()
+
+        def drive(stage: Stage, **inputs: Output) -> Future[Output]:
+            output = outputs[stage.name] = Future[Output]()
+            running.add(threads.submit(training.run, stage, inputs, output))
+            return output
+
+        stages.train(drive, config, programs.arena)
+        kept = {name: x for name, x in outputs.items() if name not in _ONLY_PASSED_ON}
+        outputs.clear()
+        while running:
+            # A wait without timeout may not notice Ctrl-C.
+            done, running = wait(running, timeout=0.2)
+            if done:
+                devices.give_back_freed()
+    monitor.check_stop()
+    return Trained({name: output.result() for name, output in kept.items()}, training.curves)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Training:
+    """What the stages of a training share."""
+
+    key: Key
+    config: Config
+    programs: Programs
+    monitor: Monitor
+    checkpoints: Checkpoints
+    curves: dict[str, Curves] = dataclasses.field(default_factory=dict)
+
+    def run(
+        self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]], output: Future[Output]
+    ) -> None:
+        """Gives a stage its output, loaded if it was saved; saves it while others go on."""
+        is_saved = bool(stage.chunks) or stage.name in _SAVED
+        try:
+            found = self._load(stage) if is_saved else None
+            is_new = found is None
+            if is_new:
+                found = self._execute(stage, inputs)
+            output.set_result(found)
+            if is_saved and is_new:
+                if stage.chunks:
+                    self.checkpoints.save(f"curves_{stage.name}", self.curves[stage.name])
+                self.checkpoints.save(stage.name, found)
+        except BaseException as error:
+            if not isinstance(error, Stopped):
+                self.monitor.fail(error)
+            with contextlib.suppress(InvalidStateError):  # it could not be saved
+                output.set_exception(error)
+        finally:
+            self.programs.used(stage)
+
+    def _execute(self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]]) -> Output:
+        """The output of a stage that was not saved."""
+        given = jax.tree.map(lambda x: x.result() if isinstance(x, Future) else x, inputs)
+        self.monitor.check_stop()
+        output = (self._train if stage.chunks else self._once)(stage, given)
+        if not stage.is_optional:
+            self.monitor.check_finite(stage.name, "results", output)
+        return output
+
+    def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
+        """The first state."""
+        return self.programs.of(stage).begin(stage.key(self.key), self.config, inputs)
+
+    def _once(self, stage: Stage, inputs: dict[str, Output]) -> Output:
+        """The output of a stage without steps."""
+        output = stage.finish(self.config, self._begin(stage, inputs), **inputs)
+        # Joined rows lie on the host, and every program would transfer them again.
+        return jax.device_put(output)
+
+    def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
+        """The output of a stage with steps."""
+        programs, config, keys = self.programs.of(stage), self.config, stage.chunk_keys(self.key)
+        # The rate must not include compilation.
+        programs.advance.wait()
+
+        def advance(chunk: int, state: Output) -> tuple[Output, Curves]:
+            begin = time.perf_counter()
+            state, progress = programs.advance(keys[chunk], config, state, inputs)
+            seconds = np.array([time.perf_counter() - begin])
+            return state, {**self._report(stage, chunk, progress), "seconds": seconds}
+
+        try:
+            # Nobody but `run_chunks` holds the first state, so that it can let go of it.
+            state, self.curves[stage.name] = run_chunks(
+                stage,
+                self._begin(stage, inputs),
+                self._no_curves(stage),
+                advance,
+                self.monitor,
+                self.checkpoints,
+            )
+        except StageError as error:
+            if not stage.is_optional:
+                raise
+            self.monitor.warn(f"{error}: left out")
+            self.curves[stage.name] = self._no_curves(stage)
+            return _failed(programs.shapes.result().output)
+        return programs.finish(config, state, inputs)
+
+    def _report(self, stage: Stage, chunk: int, progress: Progress) -> Curves:
+        """Reports a chunk, checks its losses, and returns the steps' metrics."""
+        size = len(progress.loss)
+        done = min((chunk + 1) * size, stage.steps)
+        losses, metrics = jax.tree.map(
+            lambda x: np.asarray(x)[: done - chunk * size], (progress.loss, progress.metrics)
+        )
+        means = {
+            name: float(np.nanmean(values))
+            for name, values in metrics.items()
+            if np.isfinite(values).any()
+        }
+        self.monitor.report(stage.name, done, stage.steps, losses, **means)
+        return metrics
+
+    def _load(self, stage: Stage) -> Output:
+        """The saved output of a finished stage; None if there is none."""
+        if stage.chunks:
+            curves = self.checkpoints.load_or_forget(f"curves_{stage.name}", self._no_curves(stage))
+            if curves is None:
+                return None
+            self.curves[stage.name] = curves
+        output = self.programs.of(stage).shapes.result().output
+        return self.checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
+
+    def _no_curves(self, stage: Stage) -> Curves:
+        """The curves of a training that has not begun, or has failed."""
+        lengths = dict.fromkeys(self.programs.of(stage).shapes.result().metrics, stage.steps)
+        lengths["seconds"] = stage.chunks
+        return {name: np.full(length, np.nan, np.float32) for name, length in lengths.items()}
+
+
+def _failed(shapes: Output) -> Output:
+    """The output of a failed training: every float is NaN, everything else 0."""
+
+    def fail(x: jax.ShapeDtypeStruct) -> np.ndarray:
+        return np.full(x.shape, np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
+
+    return jax.tree.map(fail, shapes)
+
+
+def run_chunks(
+    stage: Stage,
+    state: Output,
+    curves: Curves,
+    run: Callable[[int, Output], tuple[Output, Curves]],
+    monitor: Monitor,
+    checkpoints: Checkpoints,
+) -> tuple[Output, Curves]:
+    """Runs a training from where it was last saved; saves it once a minute, and when it stops.
+
+    Args:
+      stage: with chunks.
+      state: first state.
+      curves: before the first chunk.
+      run: `(chunk, state) -> (state, metrics)`. The state before a `StageError` is saved.
+      monitor: asked whether to stop.
+      checkpoints: where to save the training.
+
+    Returns:
+      The last state and the curves of all chunks.
+    """
+    name = f"{UNFINISHED}/{stage.name}"
+
+    def save(state: Output) -> None:
+        checkpoints.save(name, {"state": state, "curves": curves})
+
+    if found := checkpoints.load_or_forget(name, {"state": state, "curves": curves}):
+        state, curves = found["state"], jax.tree.map(np.array, found["curves"])
+    saved = time.monotonic()
+    for chunk in range(np.count_nonzero(np.isfinite(curves["seconds"])), stage.chunks):
+        try:
+            after, metrics = run(chunk, state)
+        except StageError as error:
+            try:
+                save(state)
+            except OSError as lost:
+                raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
+            raise
+        state = after
+        for metric, values in metrics.items():
+            first = chunk * -(-len(curves[metric]) // stage.chunks)
+            curves[metric][first : first + len(values)] = values
+        if time.monotonic() - saved > _SAVE_PERIOD or monitor.is_stopping:
+            save(state)
+            saved = time.monotonic()
+        if chunk + 1 < stage.chunks:
+            monitor.check_stop()
+    return state, curves

@@ -8,19 +8,20 @@ import pytest
 from tiny import KEY, TINY
 
 from jaxsense import training
-from jaxsense.run import loop, pipeline
+from jaxsense.run import pipeline
+from jaxsense.run.checkpoints import Checkpoints
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs
 from jaxsense.training import learn
 
 
 @pytest.mark.slow  # compiles everything twice; `test_examples.py` runs `learn` up to the values
-def test_learn_and_a_run_come_to_the_same(monkeypatch):
+def test_learn_and_a_run_come_to_the_same(monkeypatch, tmp_path):
     monkeypatch.setattr(Programs, "_compile_missions", lambda programs: None)
     config = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
     monitor = Monitor()
     with pipeline.compiled(config, monitor) as programs:
-        found = loop.train(KEY, config, programs, monitor)
+        found = pipeline.train(KEY, config, programs, monitor, Checkpoints(tmp_path))
     # A few steps, after which rounding has not yet made learning part ways.
     learned = jax.jit(lambda key: learn(key, config))(KEY)
     assert bool(learned.is_finite)
