@@ -330,10 +330,11 @@ def main(argv: list[str] | None = None) -> None:
         config, models = rundir.load(run, arguments.trust)
         preset = str(run).removeprefix(PREFIX)
         path = path or (run / "exported.zip" if is_run else Path(f"{preset}.zip"))
-        with files.new(path) as file:
-            file.write(content := archive(config, models))
-    except FileExistsError:
-        cli.fail(PROGRAM, str(ConfigError("out", str(path), "already exists; must be a new file")))
+        if path.exists():
+            raise ConfigError("out", str(path), "already exists; must be a new file")
+        if not path.parent.is_dir():
+            raise ConfigError("out", str(path), "cannot be written (Not a directory)")
+        files.write(path, content := archive(config, models))
     except (ValueError, ModuleNotFoundError, NotImplementedError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:

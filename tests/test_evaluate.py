@@ -220,7 +220,7 @@ def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cac
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     line = error_line([str(tmp_path / "none")], capsys, evaluate)
-    assert f"{tmp_path / 'none'} is not a run directory: it has no config.json" in line
+    assert f"{tmp_path / 'none'}': is not a run directory: it has no config.json" in line
     (tmp_path / "config.json").write_text(json.dumps({"versions": {"jaxsense": "0.1.0"}}))
     assert "was written by jaxsense 0.1.0" in error_line([str(tmp_path)], capsys, evaluate)
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, PRESETS["smoke"])) as run:
@@ -249,4 +249,4 @@ def test_the_latest_run_is_the_newest_finished_one_in_runs(program, tmp_path, mo
     assert jaxsense.load("pretrained:noisy")[0] == jaxsense.load_pretrained("noisy")[0]
     # A directory of that name comes first.
     Path("latest").mkdir()
-    assert "latest is not a run directory" in error_line(["latest"], capsys, program)
+    assert "'latest': is not a run directory" in error_line(["latest"], capsys, program)

@@ -1,6 +1,5 @@
 """Files that are written as a whole, directories that are kept, and checkpoints."""
 
-import errno
 import os
 import queue
 import stat
@@ -64,33 +63,6 @@ def test_many_writers_of_one_file_never_mix(tmp_path):
         list(executor.map(lambda text: files.write(path, text), texts * 5))
     assert path.read_text(encoding="utf-8") in texts
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("has_links", [True, False])
-def test_a_new_file_has_its_name_once_it_is_whole_and_takes_that_of_no_other(
-    tmp_path, monkeypatch, has_links, synced
-):
-    def without_links(*_):
-        raise OSError(errno.EPERM, "Operation not permitted")
-
-    if not has_links:
-        monkeypatch.setattr(os, "link", without_links)
-    path, other = tmp_path / "file", tmp_path / "other"
-    with files.new(path) as file:
-        file.write(b"new")
-        assert not path.exists()
-        (partial,) = tmp_path.iterdir()
-        assert files.is_unfinished(partial, "file")
-    assert path.read_bytes() == b"new"
-    assert synced == [False, True]
-    with pytest.raises(FileExistsError), files.new(path):
-        pass
-    with pytest.raises(ZeroDivisionError), files.new(other):
-        1 / 0  # noqa: B018
-    with pytest.raises(FileExistsError), files.new(other) as file:
-        other.write_text("of another process", encoding="utf-8")
-    assert other.read_text(encoding="utf-8") == "of another process"
-    assert sorted(tmp_path.iterdir()) == [path, other]
 
 
 def test_only_what_a_write_has_left_is_removed(tmp_path):

@@ -279,7 +279,7 @@ class Program:
     def wait(self) -> Function:
         """Blocks until the program is compiled; raises what `Monitor.check_stop` does."""
         if not self._compiled.done():
-            self._monitor.announce(self._stage)
+            self._monitor.progress(self._stage, 0, 0)
             return self._monitor.wait_for(self._compiled)
         return self._compiled.result()
 

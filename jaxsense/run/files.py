@@ -7,9 +7,7 @@ import os
 import re
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import IO
 
 import filelock
 
@@ -43,56 +41,25 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
     Raises:
       WriteError: if the file cannot be written; it is then unchanged.
     """
-    with _naming_errors(path), _whole(path, Path.replace, mode) as file:
-        file.write(content.encode() if isinstance(content, str) else content)
-
-
-def new(path: Path) -> AbstractContextManager[IO[bytes]]:
-    """Opens a new file, which appears under its name only once it is complete.
-
-    Raises:
-      FileExistsError: if the path exists, now or at the end.
-      OSError: if it cannot be written.
-    """
-    if path.exists():
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
-    return _whole(path, _name)
-
-
-@contextlib.contextmanager
-def _whole(
-    path: Path, name: Callable[[Path, Path], object], mode: int = 0o666
-) -> Iterator[IO[bytes]]:
-    """Opens a partial file, which gets its name once it is on the disk."""
     # Unique, since another process may write the same file.
     partial = path.with_name(f".{path.name}.{secrets.token_hex(8)}.unfinished")
-    try:
-        partial.touch(mode, exist_ok=False)
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        name(partial, path)
-        with contextlib.suppress(OSError):  # not all systems let directories be written
-            directory = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(directory)
-            finally:
-                os.close(directory)
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-
-
-def _name(partial: Path, path: Path) -> None:
-    """Gives a file its name; raises `FileExistsError` if the name is taken."""
-    try:
-        os.link(partial, path)
-    except FileExistsError:
-        raise
-    except OSError:  # the file system has no links
-        path.open("xb").close()
-        partial.replace(path)
+    with _naming_errors(path):
+        try:
+            partial.touch(mode, exist_ok=False)
+            with partial.open("wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+            with contextlib.suppress(OSError):  # not all systems let directories be written
+                directory = os.open(path.parent, os.O_RDONLY)
+                try:
+                    os.fsync(directory)
+                finally:
+                    os.close(directory)
+        finally:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
 
 
 def write_digested(path: Path, content: bytes, mode: int = 0o666) -> None:

@@ -30,8 +30,8 @@ class Stopped(Exception):  # noqa: N818 (nothing is wrong)
 
 def is_finite(values: PyTree) -> bool:
     """Whether all floats in a pytree of arrays are finite."""
-    leaves = [x for x in jax.tree.leaves(values) if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
-    return all(np.isfinite(leaf).all() for leaf in leaves)
+    is_float = lambda x: jnp.issubdtype(jnp.result_type(x), jnp.inexact)  # noqa: E731
+    return all(np.isfinite(x).all() for x in jax.tree.leaves(values) if is_float(x))
 
 
 class Stopwatch:
@@ -112,12 +112,11 @@ class Monitor:
             wait((future,), timeout=0.2)
         return future.result()
 
-    def announce(self, stage: str) -> None:
-        """Reports that a stage is compiling."""
-        self.progress(stage, 0, 0)
-
     def progress(self, stage: str, done: int, total: int, **metrics: float) -> None:
-        """Reports how many units of work of a stage are done, of how many; one stage at a time."""
+        """Reports how many units of work of a stage are done, of how many; of none, it compiles.
+
+        One stage reports at a time.
+        """
         with self._lock:
             self._listener(stage, done, total, metrics)
 

@@ -349,24 +349,26 @@ def rewards(
       `[K, epochs]` rewards as in `pipeline.Learned.rewards`, without those of such checkpoints.
     """
     epochs = config.dqn.epochs
-    shapes: dict[str, np.ndarray] = dict.fromkeys(
-        ("reward", "evaluation", "epsilon"), np.zeros(epochs, np.float32)
-    )
-    shapes["seconds"] = np.zeros(epochs // config.dqn.chunk, np.float32)
+    lengths = dict.fromkeys(("reward", "evaluation", "epsilon"), epochs)
+    lengths |= {"seconds": epochs // config.dqn.chunk}
+    shapes = {name: np.empty(length, np.float32) for name, length in lengths.items()}
+
+    def found(network: str) -> Iterator[dict[str, np.ndarray]]:
+        for directory in (run / "checkpoints" for run in runs):
+            reason = f"{directory}: holds no curves_{network}"
+            try:
+                if curves := Checkpoints(directory).load(f"curves_{network}", shapes):
+                    yield curves
+                    continue
+            except ConfigError as error:
+                reason = str(error)
+            warn(f"{reason}; left out of reward.svg")
+
     curves: dict[str, dict[str, np.ndarray]] = {}
     for network in dict.fromkeys(learner(config, name) for name in config.modalities):
-        found: list[dict[str, np.ndarray]] = []
-        for run in runs:
-            directory, name = run / "checkpoints", f"curves_{network}"
-            try:
-                if curve := Checkpoints(directory).load(name, shapes):
-                    found.append(curve)
-                else:
-                    warn(f"{directory}: holds no {name}; left out of reward.svg")
-            except ConfigError as error:
-                warn(f"{error}; left out of reward.svg")
+        of_runs = [*found(network)]
         curves[network.removeprefix("dqn_")] = {
-            name: np.array([curve[name] for curve in found]).reshape(-1, epochs)
+            name: np.array([each[name] for each in of_runs]).reshape(-1, epochs)
             for name in ("reward", "evaluation")
         }
     return curves

@@ -21,7 +21,7 @@ from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Listener, Monitor
 from jaxsense.summary import Case, make
 from jaxsense.summary.blocks import MISSIONS
-from jaxsense.summary.compare import REFERENCE, Measured, differences
+from jaxsense.summary.compare import REFERENCE, differences
 
 _IS_POLICY = "must be a function (key, models, known) -> values that JAX can trace"
 AGAINST = (REFERENCE, "auction", "naive", "random")
@@ -61,10 +61,6 @@ class MissionScore:
         return "\n  ".join(lines)
 
 
-def _ignore(stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-    """Hears nothing."""
-
-
 @checks.typed
 def score_missions(
     config: Config,
@@ -74,7 +70,7 @@ def score_missions(
     against: Sequence[str] = AGAINST,
     episodes: int = 256,
     seed: int = 0,
-    listener: Listener = _ignore,
+    listener: Listener = lambda stage, done, total, metrics: None,
 ) -> MissionScore:
     """Evaluates policies in missions, next to built-in policies in the same arenas.
 
@@ -115,23 +111,16 @@ def score_missions(
         known = cases(config, scenario.policies)
         played = {name: known[name] for name in dict.fromkeys((*policies, *against))}
         total = episodes * len(played)
-        player = missions.Player(scenario, compiler, total, _workers(), models)
+        is_cpu = jax.default_backend() == "cpu"
+        workers = Workers(threads=devices.threads()) if is_cpu else ALONE
+        player = missions.Player(scenario, compiler, total, workers, models)
         found = player.play(jax.random.key(seed), models, played, episodes)
-    return _score(config, found.metrics, against[0])
-
-
-def _score(config: Config, found: Mapping[str, Measured], reference: str) -> MissionScore:
-    """The score of measured missions."""
-    blocks = {name: make.case(config, name, each) for name, each in found.items()}
-    for name, block in blocks.items():
+    reference, blocks = against[0], dict[str, Case]()
+    for name, each in found.metrics.items():
+        blocks[name] = make.case(config, name, each)
         if name != reference:
-            block["intervals"] = differences(found[name], found[reference])
-    return MissionScore(blocks, reference, blocks[reference]["episodes"])
-
-
-def _workers() -> Workers:
-    """Threads of a CPU, or one accelerator."""
-    return Workers(threads=devices.threads()) if jax.default_backend() == "cpu" else ALONE
+            blocks[name]["intervals"] = differences(each, found.metrics[reference])
+    return MissionScore(blocks, reference, episodes)
 
 
 def _require(
@@ -143,47 +132,41 @@ def _require(
     seed: int,
 ) -> None:
     """Checks the arguments of `score_missions`, before anything is compiled."""
-
-    def require(is_right: bool, field: str, value: object, expected: str) -> None:
-        if not is_right:
-            raise ConfigError(field, value, expected)
-
     checks.require_number("episodes", episodes)
-    is_few = episodes <= MAX_EPISODES
-    require(is_few, "episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
-    is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    is_seed = is_whole and 0 <= seed < 2**32
-    require(is_seed, "seed", seed, "must be a whole number from 0 to 2^32 - 1")
-    is_named = isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)
-    require(is_named, "policies", policies, "must be a dictionary from names to policies")
+    if episodes > MAX_EPISODES:
+        raise ConfigError("episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
+    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32) or isinstance(seed, bool):
+        raise ConfigError("seed", seed, "must be a whole number from 0 to 2^32 - 1")
+    if not (isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)):
+        raise ConfigError("policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():
-        is_policy = callable(each) or isinstance(each, Policy)
-        require(is_policy, "policies", name, "must be a function or a dqn.Policy")
+        if not (callable(each) or isinstance(each, Policy)):
+            raise ConfigError("policies", name, "must be a function or a dqn.Policy")
     names = dict.fromkeys((*POLICIES, *policies))
-    is_list = isinstance(against, list | tuple) and bool(against)
-    is_known = is_list and all(name in names for name in against)
-    require(is_known, "against", against, f"must be a list of one or more of {', '.join(names)}")
-    number = config.arena.num_pois
-    reason = "must be the number of PoIs that the models were trained with"
-    require(models.agent.plays(number), "arena.num_pois", number, reason)
+    if not (isinstance(against, list | tuple) and against and all(n in names for n in against)):
+        expected = f"must be a list of one or more of {', '.join(names)}"
+        raise ConfigError("against", against, expected)
+    if not models.agent.plays(number := config.arena.num_pois):
+        expected = "must be the number of PoIs that the models were trained with"
+        raise ConfigError("arena.num_pois", number, expected)
     require_fitting(config, models)
 
 
 def _checked(name: str, policy: Values | Policy) -> Policy:
     """The policy, which names itself if its values have another shape or dtype."""
-    wrapped = as_policy(policy)
-    require_function(f"policies[{name!r}]", wrapped.values, 3, _IS_POLICY)
+    wrapped, field = as_policy(policy), f"policies[{name!r}]"
+    require_function(field, wrapped.values, 3, _IS_POLICY)
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         try:
             found = jnp.asarray(wrapped.values(key, models, known))
         except jax.errors.JAXTypeError as error:
-            raise ConfigError(f"policies[{name!r}]", wrapped.values, _IS_POLICY) from error
+            raise ConfigError(field, wrapped.values, _IS_POLICY) from error
         number = len(known.looks) + 1
         if found.shape != (number,) or not jnp.issubdtype(found.dtype, jnp.floating):
             expected = f"must return floats of shape [{number}], one for each PoI and NOP's last"
             expected = f"{expected}; not {found.dtype}{[*found.shape]}"
-            raise ConfigError(f"policies[{name!r}]", wrapped.values, expected)
+            raise ConfigError(field, wrapped.values, expected)
         return found
 
     return dataclasses.replace(wrapped, values=values)

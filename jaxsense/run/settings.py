@@ -16,6 +16,8 @@ from jaxsense.run.version import __version__, commit, versions
 
 Json: TypeAlias = dict[str, object]
 
+_KNOWN = {"preset", "seed", "num_seeds", "config", "versions", "commit", "began", "digest"}
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -33,14 +35,6 @@ class Settings:
     def seeds(self) -> range:
         """All seeds."""
         return range(self.seed, self.seed + self.num_seeds)
-
-
-class NotARunError(ConfigError):
-    """A directory that holds no run."""
-
-    def __init__(self, path: Path):
-        self.expected = "is not a run directory: it has no config.json"
-        ValueError.__init__(self, f"{path} {self.expected}")
 
 
 def as_json(settings: Settings) -> Json:
@@ -61,7 +55,7 @@ def began(path: Path) -> float:
     """When a run began, in seconds since 1970; else when its `config.json` last changed."""
     file = path / "config.json"
     try:
-        return datetime.fromisoformat(str(_read_config(file, "run", path)["began"])).timestamp()
+        return datetime.fromisoformat(str(_read(file, "run", path)["began"])).timestamp()
     except (KeyError, ValueError, OverflowError):
         return file.lstat().st_mtime
 
@@ -73,7 +67,7 @@ def read_settings(file: Path, trust: bool = False) -> Settings:
       ConfigError: if the file cannot be read, a field is unknown or wrong, or if it names custom
         sensors, whose code runs when they are made, without trust.
     """
-    return _settings_of(_read_config(file, "config", file), trust)
+    return _settings_of(_read(file, "config", file), trust)
 
 
 def resumable(path: Path, trust: bool = False) -> Settings:
@@ -91,34 +85,39 @@ def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
       ConfigError: if there is no run, if another version wrote it, if its `config.json` has changed
         since, or if it names custom sensors without trust.
     """
-    content = _read_config(path / "config.json", field, path)
-    _check_origin(content, field, path)
+    content = _read(path / "config.json", field, path)
+    # Its checkpoints may not fit otherwise.
+    recorded = content.get("versions")
+    wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
+    if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
+        by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
+        raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")
+    if content.get("digest") != _digest(content):
+        reason = "config.json has changed since the run began; start a new run with --config"
+        raise ConfigError(field, str(path), reason)
     return _settings_of(content, trust)
 
 
-def _read_config(file: Path, field: str, path: Path) -> Json:
+def _read(file: Path, field: str, path: Path) -> Json:
     """The content of a `config.json`; raises `ConfigError` about `field = path`."""
     try:
         # A file that the user names may be a link, that of a run may not lead out of it.
         real = Path(os.path.realpath(file)) if path == file else file
-        content = parse_json(inside.read(real))
+        if isinstance(content := parse_json(inside.read(real)), dict):
+            return content
+        reason = f"{file.name} must hold an object"
     except OSError as error:
         reason = f"{file.name} cannot be read ({error.strerror})"
         if path != file and isinstance(error, FileNotFoundError | NotADirectoryError):
-            raise NotARunError(path) from None
-        raise ConfigError(field, str(path), reason) from None
+            reason = "is not a run directory: it has no config.json"
     except ValueError as error:
-        raise ConfigError(field, str(path), f"{file.name} is not JSON: {error}") from None
-    if not isinstance(content, dict):
-        raise ConfigError(field, str(path), f"{file.name} must hold an object")
-    return content
+        reason = f"{file.name} is not JSON: {error}"
+    raise ConfigError(field, str(path), reason)
 
 
 def _settings_of(content: Json, trust: bool) -> Settings:
     """The settings in a `config.json`; raises `ConfigError` if one is unknown or wrong."""
-    known = {"preset", "seed", "num_seeds", "config", "versions", "commit", "began", "digest"}
-    unknown = sorted(set(content) - known)
-    if unknown:
+    if unknown := sorted(set(content) - _KNOWN):
         raise ConfigError(unknown[0], content[unknown[0]], "unknown field of a run's config.json")
     preset = content.get("preset", "default")
     if not isinstance(preset, str) or preset not in PRESETS:
@@ -134,18 +133,3 @@ def _digest(content: Json) -> str:
     """SHA-256 of the content of a `config.json`, apart from its digest."""
     rest = {name: value for name, value in content.items() if name != "digest"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
-
-
-def _check_origin(content: Json, field: str, path: Path) -> None:
-    """Raises `ConfigError` if the run's checkpoints may not fit its `config.json`.
-
-    That is so if another version wrote it, or if it has changed since the run began.
-    """
-    recorded = content.get("versions")
-    wrote = recorded.get("jaxsense") if isinstance(recorded, dict) else None
-    if not isinstance(wrote, str) or wrote.split(".")[:2] != __version__.split(".")[:2]:
-        by = f"jaxsense {wrote}" if wrote else "an older jaxsense"
-        raise ConfigError(field, str(path), f"was written by {by}; this is {__version__}")
-    if content.get("digest") != _digest(content):
-        reason = "config.json has changed since the run began; start a new run with --config"
-        raise ConfigError(field, str(path), reason)

@@ -20,15 +20,6 @@ EVALUATIONS = "evaluations"
 _MOST_CASES, _LARGEST = 1000, 1e30
 
 
-class NotFinishedError(ConfigError):
-    """A run that has not finished."""
-
-    def __init__(self, run: Path):
-        resume = f"{command('jaxsense.train')} --resume {shlex.quote(str(run))}"
-        self.expected = f"is not finished: it has no summary.json; continue it with {resume}"
-        ValueError.__init__(self, f"{run} {self.expected}")
-
-
 def read(run: Path) -> Summary:
     """The summary of a finished run, of one seed or of several.
 
@@ -36,7 +27,9 @@ def read(run: Path) -> Summary:
       ConfigError: if there is no summary, or a value in it is missing or wrong.
     """
     if not os.path.lexists(run / "summary.json"):
-        raise NotFinishedError(run)
+        resume = f"{command('jaxsense.train')} --resume {shlex.quote(str(run))}"
+        reason = f"is not finished: it has no summary.json; continue it with {resume}"
+        raise ConfigError("run", str(run), reason)
     return cast(Summary, _read(run, run / "summary.json", Summary))
 
 

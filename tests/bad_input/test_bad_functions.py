@@ -121,7 +121,10 @@ def changed(section, **values):
 
 
 FUNCTIONS = {
-    "load": (lambda w: jaxsense.load(""), ". is not a run directory: it has no config.json"),
+    "load": (
+        lambda w: jaxsense.load(""),
+        "run = '.': is not a run directory: it has no config.json",
+    ),
     "score name": (lambda w: jaxsense.score("map-v0", "greedy"), f"policy = 'greedy': {IS_POLICY}"),
     "score swapped": (lambda w: jaxsense.score(nop, "map-v0"), f"task = nop: {IS_TASK}"),
     "score returns real": (

@@ -80,7 +80,10 @@ def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, pro
     existing = tmp_path / "precious.zip"
     existing.write_text("precious")
     argv, expected = {
-        "run": ([str(tmp_path / "no_run")], "no_run is not a run directory: it has no config.json"),
+        "run": (
+            [str(tmp_path / "no_run")],
+            "no_run': is not a run directory: it has no ",
+        ),
         "out": ([str(run), "--out", str(existing)], "out = .*already exists; must be a new file"),
         "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
     }[problem]
