@@ -110,17 +110,9 @@ def _play(
 
 def _films(scenario: mission.Mission, models: Models, played: dict[str, Played]) -> dict[str, str]:
     """Animations of the missions, which last equally long."""
-    config, fields = scenario.config, scenario.fields_of_view
-    recordings = {name: each.recording for name, each in played.items()}
-    lasts = max(film.duration_of(config, each.end) for each in recordings.values())
-    return {
-        name: page.drawing(
-            film.draw(
-                config, each.records, each.end, models.fusion, fields, f"{name} policy", lasts
-            )
-        )
-        for name, each in recordings.items()
-    }
+    recordings = {f"{name} policy": each.recording for name, each in played.items()}
+    films = film.draw(scenario.config, recordings, models.fusion, scenario.fields_of_view)
+    return {name: page.drawing(each) for name, each in zip(played, films, strict=True)}
 
 
 def _sentence(policy: str) -> str:

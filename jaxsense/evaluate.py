@@ -1,7 +1,6 @@
 """`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
 import dataclasses
-import functools
 import sys
 import time
 from collections.abc import Callable
@@ -25,7 +24,7 @@ from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
-from jaxsense.show import drawing, film, page, result_plots, tables
+from jaxsense.show import drawing, film, page, plots, tables
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare
 from jaxsense.summary.blocks import policies as policies_of
@@ -115,14 +114,11 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
             found = player.play(key, models, played, arguments.episodes)
             times.append(time.perf_counter())
         block = summary.missions(scenario, found.metrics)
-        draw = functools.partial(
-            film.draw,
-            config,
-            found.recording.records,
-            found.recording.end,
-            models.fusion,
-            scenario.fields_of_view,
-        )
+        fields = scenario.fields_of_view
+
+        def draw(title: str) -> str:
+            return film.draw(config, {title: found.recording}, models.fusion, fields)[0]
+
         written = _write(arguments, trained, config, block, draw)
     except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
@@ -172,7 +168,7 @@ def _write(
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
         if policies_of(found["mission"]):
-            plot = result_plots.policies(found["mission"])
+            plot = plots.policies(found["mission"])
             files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return [*written, f"The metrics are in {path}, and with all others in {report}."]
@@ -186,7 +182,7 @@ def _report(run: Path, config: Config) -> Path:
     made = [_evaluation(config, own["mission"], own), *found.values()]
     places = [each for each in made if _is_alike(each)]
     if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
-        files.write(run / "teams.svg", drawing.svg(result_plots.places(places)))
+        files.write(run / "teams.svg", drawing.svg(plots.places(places)))
     files.write(path, page.render(run, config, own, found))
     return path
 

@@ -297,10 +297,10 @@ def _results(
     with ThreadPoolExecutor(1, "draw") as artist:
         learned = pipeline.learn(key, config, programs, monitor, run.checkpoints)
         of_training = artist.submit(lambda: _drawing().of_training(config, learned))
-        played = pipeline.play(key, config, programs, learned, run.checkpoints)
-        of_missions = artist.submit(lambda: _drawing().of_missions(config, learned, played))
+        played, block = pipeline.play(key, config, programs, learned, run.checkpoints)
+        of_missions = artist.submit(lambda: _drawing().of_missions(config, learned, played, block))
         pictures = of_training.result() | of_missions.result()
-    return {**learned.results, "mission": played.missions}, pictures
+    return {**learned.results, "mission": block}, pictures
 
 
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:

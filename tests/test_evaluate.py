@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 import io
 import json
 import os
@@ -77,10 +76,10 @@ def copy(evaluated, tmp_path):
 
 def write(arguments, missions):
     config, models = jaxsense.load(arguments.run)
-    played = recording()
-    draw = functools.partial(
-        film.draw, config, played.records, played.end, models.fusion, FIELDS_OF_VIEW
-    )
+
+    def draw(title):
+        return film.draw(config, {title: recording()}, models.fusion, FIELDS_OF_VIEW)[0]
+
     return evaluate._write(arguments, config, config, missions, draw)
 
 

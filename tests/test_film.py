@@ -14,11 +14,9 @@ from jaxsense.show.svg import Timeline
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def draw(config=CONFIG, played=None, fusion=FUSION, fields_of_view=FIELDS_OF_VIEW, lasts=0.0):
-    played = played or recording()
-    return film.draw(
-        config, played.records, played.end, fusion, fields_of_view, "latent policy", lasts
-    )
+def draw(fields_of_view=FIELDS_OF_VIEW):
+    (drawn,) = film.draw(CONFIG, {"latent policy": recording()}, FUSION, fields_of_view)
+    return drawn
 
 
 KEYFRAMES = {}

@@ -24,8 +24,7 @@ def run(tmp_path_factory):
     path.mkdir()
     for name in ("latent_space", "reward"):
         (path / f"{name}.svg").write_bytes(drawing.svg(Figure(figsize=(8, 4))))
-    played = recording()
-    drawn = film.draw(CONFIG, played.records, played.end, FUSION, FIELDS_OF_VIEW, "latent policy")
+    (drawn,) = film.draw(CONFIG, {"latent policy": recording()}, FUSION, FIELDS_OF_VIEW)
     (path / "mission.svg").write_text(drawn)
     found = {**SUMMARY, "commit": "0123abc"}
     (path / "report.html").write_text(page.render(path, CONFIG, found), encoding="utf-8")

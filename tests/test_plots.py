@@ -8,7 +8,7 @@ from matplotlib.collections import PatchCollection
 
 from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief
-from jaxsense.show import colours, latent_plots, result_plots
+from jaxsense.show import colours, plots
 from jaxsense.sim import sensors
 from jaxsense.training.measures import reliability
 
@@ -26,7 +26,7 @@ def lines(axes):
 
 
 def test_the_evaluation_is_drawn_where_it_was_played():
-    (axes,) = result_plots.rewards({"camera": CURVES}, {"camera": AGENT}).axes
+    (axes,) = plots.rewards({"camera": CURVES}, {"camera": AGENT}).axes
     drawn = lines(axes)
     np.testing.assert_array_equal(drawn["without exploration"].get_xdata(), [9, 19, 29, 39])
     np.testing.assert_array_equal(drawn["without exploration"].get_ydata(), [1, 2, 3, 4])
@@ -42,7 +42,7 @@ def test_the_evaluation_is_drawn_where_it_was_played():
     # A bad policy is shown too, .5 below it. Robots alone on the map share an axis.
     bad = {"return": -2.0, "optimal": 3.0, "naive": 3.0, "random": -1.0}
     both = {"camera": CURVES, "lidar": CURVES}
-    one, other = result_plots.rewards(both, {"camera": AGENT, "lidar": bad}).axes
+    one, other = plots.rewards(both, {"camera": AGENT, "lidar": bad}).axes
     assert one.get_ylim() == other.get_ylim()
     assert one.get_ylim()[0] == -2.5
     assert "random" in lines(other)
@@ -55,7 +55,7 @@ def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
     looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
     looks = np.concatenate([looks, np.tile(rare, (3, 2, 1))], axis=1)
     belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
-    figure = result_plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief)
+    figure = plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief)
     detectors, beliefs = map(lines, figure.axes)
     points = np.array(detectors["lidar"].get_data())
     np.testing.assert_allclose(points[np.isfinite(points)], [0.9, 0.9], rtol=1e-6)
@@ -71,7 +71,7 @@ def test_camera_and_lidar_are_drawn_from_left_to_right():
         readings = np.where(is_left > np.median(is_left), 0.8, 0.4)[:, None]
         readings = np.repeat(readings, sensor.channels, axis=1).reshape(1, -1)
         windows[sensor.name] = sensor.from_left(np.repeat(readings, 3, axis=0))
-    axes = np.reshape(result_plots.scanlines(CONFIG, windows).axes, (3, 2))
+    axes = np.reshape(plots.scanlines(CONFIG, windows).axes, (3, 2))
     assert [row[0].get_ylabel() for row in axes] == [*CONFIG.arena.classes]
     assert [ax.get_title() for ax in axes[0]] == ["camera", "lidar"]
     # The PoI is expected in the middle.
@@ -99,7 +99,7 @@ def posteriors():
 
 
 def test_classes_are_named_above_their_ellipses_and_seen_where_they_look_alike():
-    figure = latent_plots.latent_space(CONFIG, posteriors())
+    figure = plots.latent_space(CONFIG, posteriors())
     figure.draw_without_rendering()
     axes, below = figure.axes[0], figure.axes[3]
     names = {text.get_text(): text for text in axes.texts}

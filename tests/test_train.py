@@ -72,7 +72,7 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     config, drawn = dataclasses.replace(PRESETS["smoke"], mission=first), []
     draw = lambda *inputs: drawn.append(inputs[-2:]) or ""  # noqa: E731
     monkeypatch.setattr(drawing.film, "draw", draw)
-    monkeypatch.setattr(drawing.result_plots, "policies", lambda missions: Figure())
+    monkeypatch.setattr(drawing.plots, "policies", lambda missions: Figure())
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
 
     def recording(steps):

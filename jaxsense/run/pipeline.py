@@ -71,21 +71,6 @@ class Learned:
     results: summary.Learned
 
 
-@dataclasses.dataclass(frozen=True)
-class Played:
-    """The results of the missions that follow a training.
-
-    Attributes:
-      recording: the first mission of the first of `config.mission.policies`.
-      naive: the same mission under naive exploration, see `missions.Played`.
-      missions: the block `mission` of `summary.json`.
-    """
-
-    recording: missions.Recording
-    naive: missions.Recording | None
-    missions: summary.Missions
-
-
 @contextlib.contextmanager
 def compiled(
     config: Config,
@@ -155,7 +140,7 @@ def play(
     programs: Programs,
     learned: Learned,
     checkpoints: Checkpoints,
-) -> Played:
+) -> tuple[missions.Played, summary.Missions]:
     """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 
     Raises:
@@ -163,11 +148,10 @@ def play(
     """
     player, episodes = programs.player.result(), config.mission.episodes
     cases = mission.cases(config, player.mission.policies)
-    played = {name: cases[name] for name in config.mission.policies}
-    found = player.play(stages.mission_key(key), learned.models, played, episodes)
+    of_run = {name: cases[name] for name in config.mission.policies}
+    played = player.play(stages.mission_key(key), learned.models, of_run, episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
-    block = summary.missions(player.mission, found.metrics)
-    return Played(found.recording, found.naive, block)
+    return played, summary.missions(player.mission, played.metrics)
 
 
 def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:

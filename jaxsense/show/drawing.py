@@ -9,9 +9,10 @@ from matplotlib.figure import Figure
 
 from jaxsense.config import Config
 from jaxsense.run import files
-from jaxsense.run.pipeline import Learned, Played
-from jaxsense.show import film, latent_plots, page, result_plots
-from jaxsense.summary import Results, Summary
+from jaxsense.run.missions import Played
+from jaxsense.run.pipeline import Learned
+from jaxsense.show import film, page, plots
+from jaxsense.summary import Missions, Results, Summary
 
 Pictures: TypeAlias = dict[str, bytes | str]
 """The content of plots and films, by the names of their files."""
@@ -43,35 +44,32 @@ def of_training(config: Config, learned: Learned) -> Pictures:
     """The plots of a training."""
     belief = learned.results["belief"]
     figures = {
-        "latent_space": latent_plots.latent_space(config, learned.posteriors),
-        "scanlines": result_plots.scanlines(config, learned.windows),
-        "calibration": result_plots.calibration(config, learned.reliability, belief),
-        "reward": result_plots.rewards(learned.rewards, learned.results["dqn"]),
+        "latent_space": plots.latent_space(config, learned.posteriors),
+        "scanlines": plots.scanlines(config, learned.windows),
+        "calibration": plots.calibration(config, learned.reliability, belief),
+        "reward": plots.rewards(learned.rewards, learned.results["dqn"]),
     }
     return {f"{name}.svg": svg(figure) for name, figure in figures.items()}
 
 
-def of_missions(config: Config, learned: Learned, played: Played) -> Pictures:
+def of_missions(config: Config, learned: Learned, played: Played, block: Missions) -> Pictures:
     """The plot of missions and the film of one, also under naive exploration."""
-    films = {f"{config.mission.policies[0]} policy": played.recording}
+    missions = {f"{config.mission.policies[0]} policy": played.recording}
     if played.naive is not None:
-        films["naive policy"] = played.naive
-    lasts = max(film.duration_of(config, each.end) for each in films.values())
-    fusion, fields = learned.models.fusion, learned.fields_of_view
-    drawn = [
-        film.draw(config, each.records, each.end, fusion, fields, title, lasts)
-        for title, each in films.items()
-    ]
+        missions["naive policy"] = played.naive
+    films = film.draw(config, missions, learned.models.fusion, learned.fields_of_view)
     names = (f"{name}.svg" for name in page.OWN_FILMS)
-    plot = svg(result_plots.policies(played.missions))
-    return {"policies.svg": plot, **dict(zip(names, drawn, strict=False))}
+    return {
+        "policies.svg": svg(plots.policies(block)),
+        **dict(zip(names, films, strict=False)),
+    }
 
 
-def of_seeds(curves: result_plots.Curves, results: Results) -> Pictures:
+def of_seeds(curves: plots.Curves, results: Results) -> Pictures:
     """The plots of several seeds together: `results` holds means and intervals."""
     return {
-        "reward.svg": svg(result_plots.rewards(curves, results["dqn"])),
-        "policies.svg": svg(result_plots.policies(results["mission"])),
+        "reward.svg": svg(plots.rewards(curves, results["dqn"])),
+        "policies.svg": svg(plots.policies(results["mission"])),
     }
 
 

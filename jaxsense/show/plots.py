@@ -1,18 +1,31 @@
-"""The plots of learning and of missions: looks, calibration, the paper's Fig. 5, policies."""
+"""The plots of a run: latent space, looks, calibration, learning, and policies in missions."""
 
-from collections.abc import Iterable, Mapping
-from typing import cast
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, cast
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxsense.config import Config
-from jaxsense.core.types import Reliability
-from jaxsense.show import colours
-from jaxsense.show.colours import SOFT, policy_colour, policy_marker
+from jaxsense.core.types import Belief, Reliability
+from jaxsense.show.colours import (
+    MARKERS,
+    SOFT,
+    as_srgb,
+    class_colour,
+    in_plane,
+    modality_colour,
+    plane,
+    policy_colour,
+    policy_marker,
+)
 from jaxsense.show.tables import counted
 from jaxsense.summary.blocks import (
     AGENTS,
@@ -34,12 +47,109 @@ Curves = dict[str, Arrays]
 rewards: `reward` of the exploring policy, and `evaluation` of the learned policy alone on the map,
 NaN where it was not played."""
 
-_ROW = 0.8  # inches, of a look
+_MOST = 20  # ellipses of a class
+_MANY_CLASSES = 9
+_MANY_TOGETHER = 3  # classes in one place, above which their names take too much room
+_NEAR = 0.2  # sigma, between classes in one place
+_DASH = 5.0  # points, of ellipses of classes in one place
+_CLASS_ROW = 0.24  # inches, of a class in the plot of sigma
+_LOOK_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
 _MIN_LOOKS = 20  # in a bin of the calibration
 _REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1), "frameon": False, "fontsize": 9}
 _ABOVE = {"loc": "lower left", "bbox_to_anchor": (0, 1), "frameon": False, "fontsize": 9}
+
+
+def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
+    """The paper's Fig. 4: posteriors of held-out detections as 1-sigma ellipses, and `||sigma||`.
+
+    The first column shows detections by all modalities together, the others by each alone, in the
+    two latent dimensions that show classes farthest apart. Where classes share a place, their
+    dashes alternate.
+
+    Args:
+      config: all settings.
+      posteriors: for `joint` and for each modality `[C, S, D]` beliefs.
+    """
+    names, classes = ["joint", *config.modalities], config.arena.classes
+    rows = _CLASS_ROW * len(classes) + 0.2
+    figure = Figure(figsize=(3.6 * len(names) + 1.2, 4.6 + rows), layout="compressed")
+    above, below = figure.subplots(
+        2, len(names), squeeze=False, sharex="row", sharey="row", height_ratios=(3.6, rows)
+    )
+    shown = {n: jax.tree.map(lambda x: np.asarray(x)[:, :_MOST], posteriors[n]) for n in names}
+    colours = [class_colour(config.arena, label) for label in classes]
+    dimensions = plane(np.mean(posteriors["joint"].mean, axis=1))
+    flat = {n: jax.tree.map(lambda x: in_plane(x, dimensions), b) for n, b in shown.items()}
+    for top, bottom, name in zip(above, below, names, strict=True):
+        top.set_title(" & ".join(config.modalities) if name == "joint" else f"{name} alone")
+        _draw_beliefs(top, flat[name], classes, colours)
+        _draw_norms(bottom, np.linalg.norm(shown[name].std, axis=-1), colours)
+        top.set_xlabel(f"latent dimension {dimensions[0] + 1}")
+        top.set_aspect("equal", adjustable="box")
+        bottom.set_xlabel("norm of sigma of each detection")
+    above[0].set_ylabel(f"latent dimension {(*dimensions, 1)[1] + 1}")
+    below[0].set_yticks(range(len(classes)), classes)
+    below[0].set_ylim(len(classes) - 0.5, -0.5)
+    # A square around all ellipses, with room for the names of classes.
+    low = np.min([belief.mean - belief.std for belief in flat.values()], axis=(0, 1, 2))
+    high = np.max([belief.mean + belief.std for belief in flat.values()], axis=(0, 1, 2))
+    (x, y), half = (low + high) / 2, 0.68 * np.max(high - low)
+    above[0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    return figure
+
+
+def _draw_beliefs(ax: Axes, belief: Belief, classes: Sequence[str], colours: Sequence[str]) -> None:
+    """Draws `[C, S, 2]` beliefs and the names of their classes."""
+    mean, std = np.asarray(belief.mean), np.asarray(belief.std)
+    centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
+    for together in _groups(centre, spread):
+        for place, c in enumerate(together):
+            dash = (place * _DASH, (_DASH, _DASH * (len(together) - 1)))
+            style: dict[str, Any] = {"facecolors": "none", "edgecolors": colours[c]}
+            patches = [Ellipse(m, *(2 * s)) for m, s in zip(mean[c], std[c], strict=True)]
+            line = "-" if len(together) == 1 else dash
+            ax.add_collection(PatchCollection(patches, alpha=0.5, linestyles=[line], **style))
+            # Hollow and of another shape, so that classes in one place are all seen.
+            ax.scatter(*mean[c].T, s=30, marker=MARKERS[c % len(MARKERS)], linewidths=1.0, **style)
+        first, names = together[0], [classes[c] for c in together]
+        if len(names) > _MANY_TOGETHER:
+            names[_MANY_TOGETHER - 1 :] = [f"{len(names) - _MANY_TOGETHER + 1} more"]
+        name = ax.annotate(
+            "\n".join(names),
+            (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
+            (0, 4),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=9 if len(classes) <= _MANY_CLASSES else 6.5,
+            path_effects=[withStroke(linewidth=3, foreground="white")],
+        )
+        # Room for a long name would leave none for the axes.
+        name.set_in_layout(False)
+
+
+def _draw_norms(ax: Axes, norms: np.ndarray, colours: Sequence[str]) -> None:
+    """Draws `[C, S]` norms of sigma, a row for each class."""
+    for c, of_class in enumerate(norms):
+        # Side by side across the row, so that equal ones are seen.
+        heights = c + np.linspace(-0.25, 0.25, len(of_class))
+        style = {"facecolors": "none", "edgecolors": colours[c], "linewidths": 0.8}
+        ax.scatter(of_class, heights, s=14, marker=MARKERS[c % len(MARKERS)], **style)
+    ax.grid(axis="x", alpha=0.3)
+
+
+def _groups(centre: np.ndarray, spread: np.ndarray) -> list[list[int]]:
+    """Classes with `[C, 2]` centres, those in one place together."""
+    found, waiting = [], list(range(len(centre)))
+    while waiting:
+        first = waiting[0]
+        apart = (centre[waiting] - centre[first]) / np.maximum(spread[first], 1e-6)
+        is_near = np.linalg.norm(apart, axis=-1) < _NEAR
+        found.append([c for c, near in zip(waiting, is_near, strict=True) if near])
+        waiting = [c for c in waiting if c not in found[-1]]
+    return found
 
 
 def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
@@ -53,12 +163,12 @@ def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
       windows: for each modality `[C, window, channels]` readings, from left to right.
     """
     classes = config.arena.classes
-    figure = Figure(figsize=(9, _ROW * len(classes) + 0.8), layout="constrained")
+    figure = Figure(figsize=(9, _LOOK_ROW * len(classes) + 0.8), layout="constrained")
     axes = figure.subplots(len(classes), len(windows), squeeze=False, sharex="col")
     for c, (label, row) in enumerate(zip(classes, axes, strict=True)):
         row[0].set_ylabel(label, rotation=0, ha="right", va="center")
         for ax, readings in zip(row, windows.values(), strict=True):
-            _draw_look(ax, readings, c, colours.class_colour(config.arena, label))
+            _draw_look(ax, readings, c, class_colour(config.arena, label))
     for ax, name in zip(axes[0], windows, strict=True):
         ax.set_title(name)
     words = "rays of the window, from left to right; distances in metres; dashed: the PoI's bearing"
@@ -70,7 +180,7 @@ def _draw_look(ax: Axes, readings: np.ndarray, c: int, colour: str) -> None:
     """Draws the look at class c of `[C, window, channels]` readings."""
     values = readings[c]
     if readings.shape[-1] == 3:  # an image
-        ax.imshow(colours.as_srgb(values)[None], aspect="auto", interpolation="none")
+        ax.imshow(as_srgb(values)[None], aspect="auto", interpolation="none")
         ax.set_yticks([])
     else:
         top = 1.05 * np.max(readings, initial=0.0, where=np.isfinite(readings))
@@ -164,7 +274,7 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
         is_shown = found.looks >= _MIN_LOOKS  # bins of few looks tell nothing
         confidence, accuracy = found.confidence[is_shown], found.accuracy[is_shown]
         share = found.looks[is_shown] / np.sum(found.looks)
-        colour, marker = colours.modality_colour(i), colours.MARKERS[i % len(colours.MARKERS)]
+        colour, marker = modality_colour(i), MARKERS[i % len(MARKERS)]
         left.plot(confidence, accuracy, marker + "-", color=colour, label=name, markersize=4)
         # Hollow, for most lie on top of each other where detectors are confident.
         size = 10 + 300 * share
