@@ -22,7 +22,7 @@ from jaxsense.dqn.map_mdp import Looks, MapMdp
 from jaxsense.dqn.team_mdp import Places, TeamMdp
 from jaxsense.models import Models, require_fitting
 from jaxsense.sim import world as worlds
-from jaxsense.sim.domain import make_domain
+from jaxsense.sim.windows import make_domain
 from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
@@ -93,7 +93,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
 
     Raises:
       ValueError: if the shapes of `models` or `looks` do not match `config`, `models.fusion` is no
-        `Fusion`, or `Live` looks lie outside the detectors' domains, see `sim.Domain`.
+        `Fusion`, or `Live` looks lie outside the detectors' domains, see `sim.windows.Domain`.
     """
     require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
@@ -191,9 +191,13 @@ def repeats(
         farthest = jnp.where(jax.random.bernoulli(move_key), _FARTHEST_MOVE, 0.0)
         drawn, poi = worlds.random_scene(scene_key, world, classes, places), jnp.int32(0)
         first, seen = worlds.look(first_key, world, drawn, modality, poi)
-        again = jax.vmap(lambda key: worlds.look_again(key, world, seen, modality, poi, farthest))
+
+        def again(key: Key) -> tuple[jax.Array, jax.Array, jax.Array]:
+            found, moved = worlds.look(key, world, seen, modality, poi, farthest)
+            return *found, moved.poses[modality, :2]
+
         first = (*first, seen.poses[modality, :2])
-        later = again(jnp.stack(later_keys))
+        later = jax.vmap(again)(jnp.stack(later_keys))
         return jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), first, later)
 
     batch = min(_SCENES_AT_ONCE, len(keys))

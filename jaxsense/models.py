@@ -19,16 +19,15 @@ from jaxsense.dqn.map_agent import MapAgent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Agent
 from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.sim import search as searching
 from jaxsense.sim import sensors, windows
-from jaxsense.sim.domain import Domain, make_domain
 from jaxsense.sim.sensors import Sensor
-from jaxsense.vae import detectors, filter, frames, fusion, jmvae, leave_one_out, novelty, readout
+from jaxsense.sim.windows import Domain, make_domain
+from jaxsense.vae import detectors, frames, fusion, jmvae, leave_one_out, novelty, readout
 from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Classifier, Detection, Detector
 from jaxsense.vae.frames import Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
-from jaxsense.vae.leave_one_out import Encoder, Shape
+from jaxsense.vae.leave_one_out import Encoder
 from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Readout
 
@@ -77,7 +76,7 @@ class Models:
         """What a look says, from a whole scan.
 
         Unknown if distance, bearing or sensor are not as the detector has learned them, see
-        `sim.Domain`, or if a reading of the window is negative, NaN or a brightness above 1. A
+        `windows.Domain`, or if a reading of the window is negative, NaN or a brightness above 1. A
         distance that is infinite or 0, of a beam without a return, counts as `sensor.window_limit`.
 
         Args:
@@ -96,7 +95,7 @@ class Models:
         checks.require_index("modality", modality, len(self.detectors))
         checks.require_shape(f"readings of {sensor.name}", readings, sensor.shape)
         bearing = windows.wrapped(jnp.asarray(bearing))
-        of_window = windows.around(searching.widened(sensor, search), readings, bearing)
+        of_window = windows.around(windows.widened(sensor, search), readings, bearing)
         return self.detect_in_window(modality, sensor, of_window, bearing, distance, search)
 
     def detect_in_window(
@@ -111,17 +110,17 @@ class Models:
         """What a look says, from the rays that the detector reads; otherwise as `detect`.
 
         `readings` are `[window, ...]`, around the PoI's bearing; with a search, those of
-        `sim.search.widened`.
+        `sim.windows.widened`.
         """
-        wide, bearing = searching.widened(sensor, search), windows.wrapped(bearing)
+        wide, bearing = windows.widened(sensor, search), windows.wrapped(bearing)
         window = windows.as_window(wide, jnp.where(sensor.is_valid(readings), readings, jnp.nan))
         detector, domain = self.detectors[modality], self.domains[modality]
         # What has not been learned is expected nowhere.
         expected = jnp.where(domain.contains(sensor, bearing, distance), distance, jnp.nan)
         if not search.applies:
             return detectors.detect(detector, window, expected)
-        tried = searching.candidates(sensor, search, window, bearing, expected)
-        return detectors.search(detector, tried.windows, tried.distances, tried.log_prior)
+        tried = windows.candidates(sensor, search, window, bearing, expected)
+        return detectors.search(detector, *tried)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
         """Classes that are plausible given a `[D]` belief, see `vae.readout`."""
@@ -169,15 +168,15 @@ def make_frame(config: Config, sensor: Sensor) -> Frame:
     )
 
 
-def make_shape(config: Config) -> Shape:
-    """Sizes of the networks of a JMVAE that learns from scans."""
+def make_scan_jmvae(config: Config) -> Jmvae:
+    """The shape of a JMVAE that learns from scans, whose features are looks in their frames."""
 
     def size(sensor: Sensor) -> int:
         window = jax.ShapeDtypeStruct((sensor.window * sensor.channels,), jnp.float32)
         return jax.eval_shape(make_frame(config, sensor), window).shape[0]
 
     inputs = tuple(map(size, sensors.make(config)))
-    return Shape(config.modalities, inputs, config.jmvae.latent_size, config.jmvae.hidden)
+    return Jmvae(config.modalities, inputs, config.jmvae.latent_size, config.jmvae.hidden)
 
 
 def make_prior(config: Config) -> Belief:
@@ -217,56 +216,57 @@ def make_agent(config: Config) -> Agent:
 
 def make_readout(config: Config, classes: Belief) -> Readout:
     """Readout of class probabilities from `[C, D]` mean joint posteriors of the classes."""
-    return readout.make(classes, readout.directions(make_jmvae(config).feature_sizes))
+    return readout.make(classes, make_jmvae(config).feature_sizes)
 
 
 @checks.typed
 def make_in_place(config: Config, params: Params, classes: Belief) -> fusion.InPlace:
     """The paper's fusion in place, see `vae.InPlace`."""
     model, read = make_jmvae(config), make_readout(config, classes)
-    return fusion.InPlace(params, classes, make_prior(config), read, model)
+    return fusion.InPlace(classes, make_prior(config), read, model, params)
 
 
 def make_detector(
     key: Key, config: Config, modality: int, windows: Float[Array, "S F"]
 ) -> Classifier:
-    """Untrained detector of a modality; its input is standardised by `windows` for training."""
-    num_labels = len(config.labels(config.modalities[modality]))
+    """Untrained detector of a modality; its input is standardised by `windows` for training.
+
+    If the JMVAE learns from scans, it knows a single label, any PoI.
+    """
     is_range = sensors.make(config)[modality].measures_distance
-    return detectors.init(key, windows, num_labels, config.detector, is_range)
+    labels = config.labels(config.modalities[modality])
+    number = 1 if config.jmvae.reads_scans else len(labels)
+    return detectors.init(key, windows, number, config.detector, is_range)
 
 
 def make_encoder(
-    key: Key,
     config: Config,
     modality: int,
-    windows: Float[Array, "S F"],
+    presence: Classifier,
     params: Params,
     scaling: Scaling,
     classes: Belief,
 ) -> Encoder:
-    """Encoder of a modality as a detector that has not learned yet where a PoI is.
+    """Encoder of a modality as a detector.
 
     Args:
-      key: random key of the detector of presence.
       config: all settings.
       modality: index of the sensor.
-      windows: for training, which standardise the input of the detector of presence.
+      presence: from `make_detector`, also once trained.
       params: of the JMVAE.
       scaling: the frame in which the encoder sees windows.
       classes: `[C, D]` mean joint posterior of each class.
     """
-    sensor = sensors.make(config)[modality]
+    name = config.modalities[modality]
     return Encoder(
-        params=params["encoders"][sensor.name],
+        params=params["encoders"][name],
         scaling=scaling,
-        presence=detectors.init(key, windows, 1, config.detector, sensor.measures_distance),
-        classes=classes,
+        presence=presence,
         readout=make_readout(config, classes),
         prior=make_prior(config),
         sharpness=jnp.float32(1.0),
-        shape=make_shape(config),
-        label_of_class=config.label_of_class(sensor.name),
+        model=make_scan_jmvae(config),
+        label_of_class=config.label_of_class(name),
     )
 
 
@@ -279,24 +279,26 @@ def init(key: Key, config: Config) -> Models:
     shape = len(config.arena.classes), model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape))
     made, keys = sensors.make(config), jax.random.split(detector_key, len(config.modalities))
-    windows = [jnp.zeros((2, sensor.window * sensor.channels)) for sensor in made]
+    untrained: tuple[Detector, ...] = tuple(
+        make_detector(k, config, m, jnp.zeros((2, made[m].window * made[m].channels)))
+        for m, k in enumerate(keys)
+    )
     if config.jmvae.reads_scans:
-        shape = make_shape(config)
-        params = leave_one_out.init(jmvae_key, shape)
+        of_scans = make_scan_jmvae(config)
+        params = leave_one_out.init(jmvae_key, of_scans)
         scalings = [
             Scaling(make_frame(config, sensor), jnp.zeros(size), jnp.float32(1.0))
-            for sensor, size in zip(made, shape.inputs, strict=True)
+            for sensor, size in zip(made, of_scans.feature_sizes, strict=True)
         ]
         untrained = tuple(
-            make_encoder(k, config, m, windows[m], params, scalings[m], classes)
-            for m, k in enumerate(keys)
+            make_encoder(config, m, presence, params, scalings[m], classes)
+            for m, presence in enumerate(untrained)
         )
     else:
         params = jmvae.init(jmvae_key, model)
-        untrained = tuple(make_detector(k, config, m, windows[m]) for m, k in enumerate(keys))
     fusions: dict[str, Callable[[], Fusion]] = {
         "in_place": lambda: make_in_place(config, params, classes),
-        "filter": lambda: filter.init(filter_key, model, classes, make_prior(config)),
+        "filter": lambda: fusion.init_filter(filter_key, model, classes, make_prior(config)),
     }
     return make_models(
         config,

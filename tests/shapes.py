@@ -46,7 +46,7 @@ def main() -> None:
     from training.tiny import KEY, TINY
 
     import jaxsense
-    from jaxsense import mission, vae
+    from jaxsense import mission
 
     team = dataclasses.replace(
         TINY,
@@ -64,11 +64,11 @@ def main() -> None:
 
     mdp = jaxsense.make_mdp(TINY, models, jaxsense.Bank((jnp.full((3, 4, 2), 0.5),) * 2))
     look, seen, two = jnp.full(2, 0.5), jnp.zeros(2, bool), jnp.zeros(2)
-    vae.bayes_update(two, look, jnp.arange(2))
+    models.bayes.update(models.bayes.prior, look, 1)
     models.fusion.update(models.fusion.prior, seen, look, 1)
     wrong = {
         "kl_divergence": lambda: kl_divergence(two, two, jnp.zeros(3), two),
-        "bayes_update": lambda: vae.bayes_update(two, look, jnp.zeros(2)),
+        "log_likelihoods": lambda: models.bayes.log_likelihoods(look[None], 0),
         "observe": lambda: mdp.looks.observe(KEY, jnp.arange(3), jnp.arange(1), 0),
         "detect": lambda: detect(models.detectors[0], jnp.zeros((1, 240)), jnp.ones(())),
         "update": lambda: models.fusion.update(models.fusion.prior, two, look, 1),

@@ -18,7 +18,7 @@ from jaxsense.dqn import map_mdp, rewards
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
-from jaxsense.vae import detectors, filter, fusion, jmvae
+from jaxsense.vae import detectors, fusion, jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = replace(PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(8,)))
@@ -113,7 +113,9 @@ def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(model
     # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
     classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
     prior = fusion.prior(MODEL, 20.0)
-    found = jax.jit(lambda key: filter.init(key, MODEL, classes, prior, (1,)))(jax.random.key(0))
+    found = jax.jit(lambda key: fusion.init_filter(key, MODEL, classes, prior, (1,)))(
+        jax.random.key(0)
+    )
     of_moments = np.linalg.pinv(found.readout.of_classes)
     kernel = jnp.float32(np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]) @ of_moments.T)
     layer = {"kernel": kernel, "bias": jnp.zeros(len(of_moments))}

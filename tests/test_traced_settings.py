@@ -120,9 +120,11 @@ def test_weights_of_reconstruction_may_be_traced():
         settings = dataclasses.replace(CONFIG.jmvae, reconstruction_weights=weights)
         features = jnp.ones(2), jnp.zeros(2)
         weights = settings.reconstruction_weights
-        return jmvae.loss(
-            key, params, model, features, alpha=0.1, beta=0.1, reconstruction_weights=weights
-        )[0]
+        noise, columns = jax.random.normal(key, (2, 1)), tuple(x[:, None] for x in features)
+        found, _ = jmvae.losses(
+            noise, params, model, columns, alpha=0.1, beta=0.1, reconstruction_weights=weights
+        )
+        return found[0]
 
     traced, constant = jax.jit(loss), jax.jit(lambda: loss((3.0, 0.5)))
     np.testing.assert_allclose(traced((3.0, 0.5)), constant(), rtol=1e-5)

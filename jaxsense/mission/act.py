@@ -29,8 +29,7 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
-from jaxsense.sim import localisation, viewpoints
-from jaxsense.sim import search as searching
+from jaxsense.sim import localisation, viewpoints, windows
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
@@ -257,7 +256,7 @@ def _look(
     """Whether a scan detects its PoI with enough confidence, and what it would change."""
     world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
     search = Search(*mission.config.mission.localisation.search)
-    wide = tuple(searching.widened(each, search) for each in world.sensors)
+    wide = tuple(windows.widened(each, search) for each in world.sensors)
     world = dataclasses.replace(world, sensors=wide)
     time, bearing = mission.time(state), aim.bearing
     readings = worlds.scan_around(

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import Config
 from jaxsense.core.types import Key
 from jaxsense.recorded.reading import RecordedLooks
-from jaxsense.sim import absence, windows
 from jaxsense.sim import arena as arenas
+from jaxsense.sim import viewpoints, windows
 from jaxsense.sim import world as worlds
 from jaxsense.sim.light import random_light
 from jaxsense.sim.world import Scene, World
@@ -116,7 +116,7 @@ def simulate(
     layout_key, light_key, error_key, noise_key = jax.random.split(key, 4)
     config, limit = world.arena.config, jnp.radians(world.viewpoint.bearing_error)
     layout = arenas.random_layout(layout_key, config, jnp.full(config.num_pois, poi_class))
-    away = jnp.array(absence.outside(config))
+    away = jnp.array(viewpoints.outside(config))
     true = bearing - jax.random.uniform(error_key, minval=-limit, maxval=limit)
     centre = distance * jnp.stack([jnp.cos(true), jnp.sin(true)])
     positions = jnp.tile(away, (config.num_pois, 1)).at[0].set(centre)
@@ -124,8 +124,7 @@ def simulate(
     layout = dataclasses.replace(layout, position=positions)
     scene = Scene(layout, random_light(light_key, world.reads_conditions), poses)
     data = arenas.place(world.arena, layout, poses)
-    readings = worlds.scan_around(noise_key, world, scene, data, modality, bearing, modality)
-    return windows.as_window(world.sensors[modality], readings)
+    return worlds.window_around(noise_key, world, scene, data, modality, bearing)
 
 
 def nearest(

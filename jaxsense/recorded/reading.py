@@ -129,18 +129,13 @@ def resample(
       known.
 
     Raises:
-      ValueError: if an angle is no direction, or the recorded rays are too few or too far apart.
+      ValueError: if the recorded rays are too few or too far apart.
     """
-    angles = np.asarray(angles, np.float64)
-    resampling.require_angles(f"angles of {sensor.name}", angles)
-    if readings.shape[1:2] != angles.shape:
-        expected = f"must be {readings.shape[1:2]}, one for each ray of the scans"
-        raise ValueError(f"angles of {sensor.name} have the shape {angles.shape}: {expected}")
-    step, between = np.degrees(sensor.steps[1]), np.degrees(resampling.median_step(angles))
-    if between > resampling.MAX_STEPS * step:
-        expected = f"must be at most {resampling.MAX_STEPS * step:.2f} degrees"
+    most = resampling.MAX_STEPS * np.degrees(sensor.steps[1])
+    between = np.degrees(resampling.median_step(angles))
+    if between > most:
         found = f"step between the rays of {sensor.name} = {between:.2f} degrees"
-        raise ValueError(f"{found}: {expected}")
+        raise ValueError(f"{found}: must be at most {most:.2f} degrees")
     needed = (sensor.window - 1) * sensor.stride + 1
     covered = resampling.covered(sensor.angles, angles, sensor.steps[1])
     runs = (sum(1 for _ in run) for is_covered, run in itertools.groupby(covered) if is_covered)

@@ -10,7 +10,6 @@ with contextlib.redirect_stdout(io.StringIO()):
 from jaxsense.sim.arena import make_layout as make_layout
 from jaxsense.sim.arena import place as place
 from jaxsense.sim.arena import random_layout as random_layout
-from jaxsense.sim.domain import Domain as Domain
 from jaxsense.sim.raycast import CrossSection as CrossSection
 from jaxsense.sim.raycast import Fan as Fan
 from jaxsense.sim.raycast import Pinhole as Pinhole

@@ -103,12 +103,6 @@ def random_light(key: Key, has_conditions: bool = False) -> Light:
     return Light(direction, 0.2 + 0.6 * diffuse, 0.3 + 0.3 * ambient, conditions)
 
 
-def changes_light(config: CameraConfig) -> bool:
-    """Whether exposure, colour cast, low light or shadows are switched on."""
-    amounts = config.exposure_error, config.colour_cast, config.low_light, config.shadow
-    return any(amount > 0 for amount in amounts)
-
-
 def lighting(
     values: Float[Array, "8"], place: Float[Array, "B"], config: CameraConfig
 ) -> tuple[Float[Array, "3"], Float[Array, "B"]]:

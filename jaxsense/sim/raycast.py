@@ -6,7 +6,7 @@ is thus a set of circles and rectangles, whose intersections with a ray have a c
 
 import dataclasses
 import functools
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import chex
 import jax
@@ -28,7 +28,6 @@ Origin = Float[Array | np.ndarray, "2"]
 """Start of rays, in metres."""
 
 
-@runtime_checkable
 class Rays(Protocol):
     """Directions of B rays; frozen and hashable, static under `jit`."""
 

@@ -24,7 +24,7 @@ from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, raycast
 from jaxsense.sim.arena import Arena, Layout, robot_poses
-from jaxsense.sim.light import Light, changes_light, lighting
+from jaxsense.sim.light import Light, lighting
 from jaxsense.sim.raycast import Fan, Pinhole, Rays
 
 _BACKGROUND = (0.5, 0.6, 0.7)  # colour outside the arena
@@ -244,7 +244,9 @@ class Camera(Sensor):
     @property
     def reads_conditions(self) -> bool:
         """See `Sensor.reads_conditions`: whether the settings change the light."""
-        return changes_light(self.config)
+        of = self.config
+        amounts = of.exposure_error, of.colour_cast, of.low_light, of.shadow
+        return any(amount > 0 for amount in amounts)
 
 
 def lidar(config: LidarConfig) -> Lidar:

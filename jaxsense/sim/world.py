@@ -14,10 +14,10 @@ from jaxsense.config.scene import ViewpointConfig
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
-from jaxsense.sim import absence, localisation, sensors, viewpoints, windows
 from jaxsense.sim import arena as arenas
-from jaxsense.sim.absence import View
+from jaxsense.sim import localisation, sensors, viewpoints, windows
 from jaxsense.sim.light import Light, random_light
+from jaxsense.sim.viewpoints import View
 
 
 @pytree
@@ -110,7 +110,12 @@ def random_scene(
 
 
 def look(
-    key: Key, world: World, scene: Scene, robot: int, poi: Int[Array, ""]
+    key: Key,
+    world: World,
+    scene: Scene,
+    robot: int,
+    poi: Int[Array, ""],
+    farthest: Float[Array, ""] | float | None = None,
 ) -> tuple[tuple[Float[Array, "F"], Float[Array, ""]], Scene]:
     """Places a robot at a random viewpoint of a PoI, and scans the PoI.
 
@@ -118,6 +123,8 @@ def look(
 
     Args:
       robot: index of the robot and of its modality; static.
+      farthest: distance up to which the viewpoint is from where the robot stands, in metres; most
+        of the time much less. By default anywhere.
 
     Returns:
       The detector's input and the expected distance of the PoI in metres, and the scene with the
@@ -130,56 +137,40 @@ def look(
     if not 0 <= robot < len(world.sensors):
         raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
     checks.require_index("poi", poi, world.arena.config.num_pois)
-    viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
-    others = jnp.delete(scene.poses, robot, axis=0)
-    pose, bearing = _viewpoint(viewpoint_key, world, scene.layout, others, poi)
-    return _look_from((noise_key, error_key), world, scene, robot, poi, pose, bearing)
+    others, layout = jnp.delete(scene.poses, robot, axis=0), scene.layout
+    if farthest is None:
+        viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
+        pose, bearing = _viewpoint(viewpoint_key, world, layout, others, poi)
+    else:
+        distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
+        pose, bearing = viewpoints.moved_viewpoint(
+            viewpoint_key,
+            world.viewpoint,
+            world.arena.config,
+            layout,
+            others[:, :2],
+            poi,
+            scene.poses[robot, :2],
+            farthest * jax.random.uniform(distance_key) ** 3,
+        )
+    bearing, distance = _believed(error_key, world, pose, bearing, layout.position[poi])
+    scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
+    data = arenas.place(world.arena, layout, scene.poses)
+    return (window_around(noise_key, world, scene, data, robot, bearing), distance), scene
 
 
-def look_again(
+def window_around(
     key: Key,
     world: World,
     scene: Scene,
+    data: mjx.Data,
     robot: int,
-    poi: Int[Array, ""],
-    farthest: Float[Array, ""] | float,
-) -> tuple[Float[Array, "F"], Float[Array, ""], Float[Array, "2"]]:
-    """`look` from a random distance from the robot's viewpoint, up to `farthest` [m], often little.
-
-    Returns:
-      The detector's input, the expected distance of the PoI, and the robot's position, in metres.
-    """
-    distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
-    pose, bearing = viewpoints.moved_viewpoint(
-        viewpoint_key,
-        world.viewpoint,
-        world.arena.config,
-        scene.layout,
-        jnp.delete(scene.poses, robot, axis=0)[:, :2],
-        poi,
-        scene.poses[robot, :2],
-        farthest * jax.random.uniform(distance_key) ** 3,
-    )
-    keys = noise_key, error_key
-    (window, distance), _ = _look_from(keys, world, scene, robot, poi, pose, bearing)
-    return window, distance, pose[:2]
-
-
-def _look_from(
-    keys: tuple[Key, Key],
-    world: World,
-    scene: Scene,
-    robot: int,
-    poi: Int[Array, ""],
-    pose: Float[Array, "3"],
     bearing: Float[Array, ""],
-) -> tuple[tuple[Float[Array, "F"], Float[Array, ""]], Scene]:
-    noise_key, error_key = keys
-    bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
-    scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
-    data = arenas.place(world.arena, scene.layout, scene.poses)
-    readings = scan_around(noise_key, world, scene, data, robot, bearing, robot)
-    return (windows.as_window(world.sensors[robot], readings), distance), scene
+    twin: Float[Array, "2"] | None = None,
+) -> Float[Array, "F"]:
+    """Input of the detector of a robot's own sensor, see `scan_around`."""
+    readings = scan_around(key, world, scene, data, robot, bearing, robot, twin=twin)
+    return windows.as_window(world.sensors[robot], readings)
 
 
 def scan_around(
@@ -221,7 +212,7 @@ def survey(
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
-      is_empty: whether no look shows its PoI, see `absence.without_poi`; all do by default.
+      is_empty: whether no look shows its PoI, see `viewpoints.without_poi`; all do by default.
       places: see `random_scene`.
 
     Returns:
@@ -242,13 +233,13 @@ def survey(
         view = View(
             positions=scene.layout.position,
             poses=scene.poses.at[robot].set(pose),
-            twin=jnp.array(absence.outside(world.arena.config)),
+            twin=jnp.array(viewpoints.outside(world.arena.config)),
             bearing=bearing,
             distance=distance,
         )
         if is_empty is not None:
             arena, viewpoint = world.arena.config, world.viewpoint
-            absent = absence.without_poi(
+            absent = viewpoints.without_poi(
                 absent_key, world.sensors, arena, viewpoint, view, robot, poi
             )
             view = jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
@@ -265,8 +256,7 @@ def survey(
         def read(key: Key, view: View, data: mjx.Data) -> jax.Array:
             stood = dataclasses.replace(scene, poses=view.poses)
             twin = None if is_empty is None else view.twin
-            readings = scan_around(key, world, stood, data, robot, view.bearing, robot, twin=twin)
-            return windows.as_window(world.sensors[robot], readings)
+            return window_around(key, world, stood, data, robot, view.bearing, twin)
 
         view, state = jax.tree.map(lambda x: x[robot], (views, data))
         return jax.vmap(read)(noise_keys[robot], view, state)

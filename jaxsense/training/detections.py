@@ -1,6 +1,10 @@
-"""Stages that train the detectors, and the detections that all later stages learn from."""
+"""Stages that train the detectors, and what all later stages learn from.
+
+Those are detections, and how much of a repeated look is new.
+"""
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -11,17 +15,27 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Key, Samples, pytree
-from jaxsense.models import make_detector
+from jaxsense.models import make_bayes, make_detector
 from jaxsense.sim import sensors
+from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
-from jaxsense.sim.world import Scene
-from jaxsense.training.stage import Stage, fit_stage
-from jaxsense.training.surveys import Surveys, held_out_per_class, num_scenes, num_starts
-from jaxsense.vae import detectors
+from jaxsense.sim.world import Scene, make_world
+from jaxsense.training.stage import Output, Stage, fit_stage
+from jaxsense.training.surveys import (
+    Scenes,
+    Surveys,
+    held_out_per_class,
+    num_scenes,
+    num_starts,
+    num_training,
+)
+from jaxsense.vae import detectors, novelty
 from jaxsense.vae.detectors import Classifier, Detector, Looks
+from jaxsense.vae.novelty import Novelty
 
 _NUM_CHECKS = 8192  # the most looks of each kind that set a threshold
 _SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
+_REPEATS = 4  # looks in a scene
 _ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
 
 
@@ -38,6 +52,19 @@ class Starts:
     classes: Int[Array, "S N"]
     scenes: Scene
     features: tuple[Float[Array, "S N D_m"], ...]
+
+
+@pytree
+class Shown:
+    """Classes that all looks at a PoI show together, of scenes that the JMVAE did not learn from.
+
+    Attributes:
+      calibrating: `[S, N]` int32 of the training scenes that calibrate the encoders.
+      bank: `[S', N]` int32 of the scenes of the bank.
+    """
+
+    calibrating: Int[Array, "S N"]
+    bank: Int[Array, "S' N"]
 
 
 @pytree
@@ -97,58 +124,45 @@ def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Loo
     return tuple(of_modality(keys[m], m, sensor) for m, sensor in enumerate(made))
 
 
-def fitting(
-    config: Config, detector: Classifier, shown: Looks, labels: Int[Array, " S"], nothing: Looks
-) -> detectors.Fitting:
-    """Problem of fitting a detector, without the looks that `fitted` uses."""
-    rest = jax.tree.map(lambda x: x[_num_checks(nothing) :], nothing)
-    return detectors.Fitting(config.detector, detector, shown, labels, rest)
+def detector_stage(
+    modality: int,
+    config: Config,
+    finish: Callable[..., Detector] = lambda config, classifier, **inputs: classifier,
+) -> Stage:
+    """Makes the stage that trains the detector of one modality, by its index.
 
+    If the JMVAE learns from scans, it knows a single label: that a PoI is there.
 
-def fitted(
-    config: Config, detector: Classifier, surveys: Surveys, modality: int, nothing: Looks
-) -> Classifier:
-    """Sets the threshold and the odds of a trained detector, with looks of the bank."""
-    num_bank = num_scenes(config)[1]
-    shown = surveys.others.of_scenes(slice(num_bank)).looks(modality)
-    checks = jax.tree.map(lambda x: x[:_NUM_CHECKS], shown)
-    return detectors.fitted(
-        detector, checks, jax.tree.map(lambda x: x[: _num_checks(nothing)], nothing)
-    )
+    Args:
+      finish: `(config, classifier, **inputs) -> detector`, after the training.
+    """
+    number, reads_scans = num_training(config), config.jmvae.reads_scans
+    of_class = config.label_of_class(config.modalities[modality])
 
-
-def _num_checks(nothing: Looks) -> int:
-    """Number of looks at nothing that set the threshold; the others train the detector."""
-    return min(len(nothing.distances) // 4, _NUM_CHECKS)
-
-
-def detector_stage(modality: int, config: Config) -> Stage:
-    """Makes the stage that trains the detector of one modality, by its index."""
-
-    def labelled(config: Config, surveys: Surveys) -> tuple[Looks, jax.Array, int]:
-        """Looks at PoIs, their labels, and how many to train with; the others calibrate."""
-        labels = jnp.array(config.label_of_class(config.modalities[modality]))
-        of_looks = labels[surveys.training.classes.reshape(-1)]
-        return (
-            surveys.training.looks(modality),
-            of_looks,
-            config.detector.num_training(len(of_looks)),
-        )
+    def labelled(surveys: Surveys) -> tuple[Looks, Int[Array, " S"]]:
+        """Looks at PoIs, and their labels."""
+        classes = surveys.training.classes.reshape(-1)
+        labels = jnp.zeros_like(classes) if reads_scans else jnp.array(of_class)[classes]
+        return surveys.training.looks(modality), labels
 
     def untrained(
-        key: Key, config: Config, *, surveys: Surveys, examples: tuple[Looks, ...]
+        key: Key, config: Config, *, surveys: Surveys, **_: Output
     ) -> tuple[Classifier, Params]:
-        del examples
-        shown, _, number = labelled(config, surveys)
-        detector = make_detector(key, config, modality, shown.windows[:number])
+        windows = surveys.training.looks(modality).windows[:number]
+        detector = make_detector(key, config, modality, windows)
         return detector, detector.params
 
     def problem(
-        config: Config, detector: Classifier, *, surveys: Surveys, examples: tuple[Looks, ...]
+        config: Config,
+        detector: Classifier,
+        *,
+        surveys: Surveys,
+        examples: tuple[Looks, ...],
+        **_: Output,
     ) -> detectors.Fitting:
-        shown, labels, number = labelled(config, surveys)
-        first = jax.tree.map(lambda x: x[:number], shown)
-        return fitting(config, detector, first, labels[:number], examples[modality])
+        shown, labels = jax.tree.map(lambda x: x[:number], labelled(surveys))
+        nothing = _divided(examples[modality])[1]
+        return detectors.Fitting(config.detector, detector, shown, labels, nothing)
 
     def trained(
         config: Config,
@@ -157,13 +171,16 @@ def detector_stage(modality: int, config: Config) -> Stage:
         *,
         surveys: Surveys,
         examples: tuple[Looks, ...],
-    ) -> Classifier:
+        **given: Output,
+    ) -> Detector:
         found = dataclasses.replace(detector, params=fit.params)
-        shown, labels, number = labelled(config, surveys)
-        others = jax.tree.map(lambda x: x[number:], shown)
-        if number < len(labels):
-            found = detectors.calibrate(found, others, labels[number:])
-        return fitted(config, found, surveys, modality, examples[modality])
+        others, labels = jax.tree.map(lambda x: x[number:], labelled(surveys))
+        if len(labels) and not reads_scans:
+            found = detectors.calibrate(found, others, labels)
+        bank = surveys.others.of_scenes(slice(num_scenes(config)[1])).looks(modality)
+        shown = jax.tree.map(lambda x: x[:_NUM_CHECKS], bank)
+        found = detectors.fitted(found, shown, _divided(examples[modality])[0])
+        return finish(config, found, surveys=surveys, **given)
 
     return fit_stage(
         f"detector_{config.modalities[modality]}",
@@ -174,17 +191,24 @@ def detector_stage(modality: int, config: Config) -> Stage:
     )
 
 
+def _divided(nothing: Looks) -> tuple[Looks, Looks]:
+    """Looks at nothing that set the threshold, and those that train the detector."""
+    number = min(len(nothing.distances) // 4, _NUM_CHECKS)
+    first, rest = slice(number), slice(number, None)
+    return jax.tree.map(lambda x: x[first], nothing), jax.tree.map(lambda x: x[rest], nothing)
+
+
 def detect(
     key: Key,
     config: Config,
     *,
     surveys: Surveys,
     trained: tuple[Detector, ...],
-    taken_for: Int[Array, "S N"] | None = None,
+    shown: Shown | None = None,
 ) -> Detections:
     """Applies the detectors to the surveys that they were not trained on.
 
-    Looks for training are sorted by `[S, N]` classes `taken_for`, by default the true ones.
+    Looks for training are sorted by their true classes, or by those that all looks at a PoI show.
     """
     del key
     _, num_bank, _, num_empty = num_scenes(config)
@@ -198,7 +222,7 @@ def detect(
         return tuple(looks.by_class(x[part], classes, num_classes, number) for x in values)
 
     for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
-    of_bank = others.classes[for_bank] if taken_for is None else taken_for
+    of_bank = others.classes[for_bank] if shown is None else shown.bank
     of_measuring = others.classes[for_measuring]
     starts = Starts(others.classes, others.scenes, features)
     # One scene of each group: no two starts show the same PoIs.
@@ -210,3 +234,57 @@ def detect(
         starts=jax.tree.map(lambda x: x[rows], starts),
         windows=by_class(others.windows, for_measuring, of_measuring, 1),
     )
+
+
+def learn_novelty(
+    key: Key,
+    config: Config,
+    *,
+    arena: Arena,
+    trained: tuple[Detector, ...],
+    scenes: Scenes | None = None,
+    shown: Shown | None = None,
+) -> Novelty:
+    """Learns how much of a look is new, see `vae.Novelty`; without repeated looks, all of it."""
+    number = config.detector.num_repeats
+    if not number:
+        return novelty.independent(len(trained))
+    world, exact = make_world(config, arena=arena), make_bayes(config)
+    class_key, *keys = jax.random.split(key, 1 + len(trained))
+    classes, places, taken_for = repeated(class_key, config, scenes, shown)
+
+    def fit(m: int) -> tuple[jax.Array, jax.Array]:
+        scene_keys = jax.random.split(keys[m], number)
+        *seen, positions = looks.repeats(scene_keys, world, classes, m, _REPEATS, places)
+
+        def read(*look: jax.Array) -> jax.Array:
+            return exact.log_likelihoods(detectors.features(trained[m], *look), m)
+
+        return novelty.fit(jax.vmap(jax.vmap(read))(*seen), positions, taken_for)
+
+    strength, length = zip(*map(fit, range(len(trained))), strict=True)
+    return Novelty(jnp.stack(strength), jnp.stack(length))
+
+
+def repeated(
+    key: Key, config: Config, scenes: Scenes | None, shown: Shown | None
+) -> tuple[Int[Array, "S N"], Key | None, Int[Array, " S"]]:
+    """Scenes at whose first PoIs each sensor looks again and again.
+
+    With what all looks at PoIs show, those of the bank, in another light.
+
+    Returns:
+      Classes of the PoIs, keys of their places if they are given, and the classes that the first
+      PoIs are taken for.
+    """
+    number = config.detector.num_repeats
+    if scenes is None or shown is None:
+        shape = number, config.arena.num_pois
+        classes = jax.random.randint(key, shape, 0, len(config.arena.classes))
+        return classes, None, classes[:, 0]
+    _, classes, _, places = scenes
+    assert places is not None
+    # One scene of each group; from the first again if there are fewer.
+    rows = jnp.arange(number) * config.jmvae.num_together % len(shown.bank)
+    of_bank = num_scenes(config)[0] + rows
+    return classes[of_bank], places[of_bank], shown.bank[rows, 0]

@@ -1,8 +1,9 @@
 """Stages that measure detectors, the latent space and beliefs."""
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call, pytree
 from jaxsense.models import make_bayes
-from jaxsense.training import histories
 from jaxsense.training.detections import Detections
-from jaxsense.vae import detectors, gaussian, readout
+from jaxsense.vae import gaussian, readout
 
+_BINS = 15
+_LOOKS = 6  # in a history of looks at one PoI
 _HISTORIES_AT_ONCE = 512
 _ACTIVE_VARIANCE = 0.01
 
@@ -24,30 +26,64 @@ def detector_metrics(
 ) -> dict[str, dict[str, Float[Array, ""]]]:
     """Accuracy, expected calibration error `ece` and `nll` in nats, of held-out scans."""
     del key
-
-    def measure(looks: jax.Array, label_of_class: jax.Array) -> dict[str, jax.Array]:
-        labels = jnp.repeat(label_of_class, looks.shape[1])
-        flat = looks.reshape(-1, looks.shape[-1])
-        return {
-            "accuracy": jnp.mean(looks.argmax(axis=-1) == label_of_class[:, None]),
-            "ece": detectors.calibration_error(flat, labels),
-            "nll": detectors.negative_log_likelihood(flat, labels),
+    found = {}
+    for name, (probabilities, labels) in _with_labels(config, detections.held_out).items():
+        found[name] = {
+            "accuracy": jnp.mean(probabilities.argmax(axis=-1) == labels),
+            "ece": calibration_error(probabilities, labels),
+            "nll": negative_log_likelihood(probabilities, labels),
         }
-
-    return {
-        name: measure(looks, jnp.array(config.label_of_class(name)))
-        for name, looks in zip(config.modalities, detections.held_out, strict=True)
-    }
+    return found
 
 
 def reliability(config: Config, held_out: Samples) -> dict[str, Reliability]:
     """Reliability diagrams of all detectors, from `[C, S, D_m]` features of held-out looks."""
+    return {
+        name: jax.tree.map(np.asarray, diagram(*given))
+        for name, given in _with_labels(config, held_out).items()
+    }
+
+
+def _with_labels(config: Config, held_out: Samples) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """For each modality `[S, L]` probabilities of the labels, and `[S]` labels."""
     found = {}
     for name, looks in zip(config.modalities, held_out, strict=True):
         labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
-        flat = jnp.asarray(looks).reshape(-1, looks.shape[-1])
-        found[name] = jax.tree.map(np.asarray, detectors.reliability(flat, labels))
+        found[name] = jnp.asarray(looks).reshape(-1, looks.shape[-1]), labels
     return found
+
+
+def negative_log_likelihood(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Mean of `-log p(label)` in nats."""
+    chex.assert_shape(probabilities, (len(labels), None))
+    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
+    return -jnp.mean(jnp.log(jnp.maximum(right, 1e-12)))
+
+
+def calibration_error(
+    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
+) -> Float[Array, ""]:
+    """Expected calibration error of the most likely labels (Guo et al. 2017, Sec. 2).
+
+    The difference between mean confidence and accuracy in a bin of the `diagram`, averaged over
+    all looks.
+    """
+    found = diagram(probabilities, labels)
+    share = found.looks / len(labels)
+    return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
+
+
+def diagram(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
+    """Points of a reliability diagram with fifteen bins of equal width."""
+    chex.assert_shape(probabilities, (len(labels), None))
+    confidence = jnp.max(probabilities, axis=1)
+    is_right = jnp.argmax(probabilities, axis=1) == labels
+    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
+    of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
+    sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
+    return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])
 
 
 @pytree
@@ -63,7 +99,7 @@ class LatentSpace:
         are plausible that the sensor cannot distinguish from the true one.
       moment_matching_error: `[]` mean of `moment_matching_error`.
       readout_error: `[]` nats lost between writing a belief and reading it, see
-        `histories.readout_error`.
+        `readout_error`.
       fusion: `accuracy`, `mean_error` and `std_error` of beliefs after a look by one modality and
         then by another, `[]` each; None with a single modality.
     """
@@ -111,9 +147,7 @@ def latent_space(
         unambiguous={n: share(x, same) for n, x in open_classes.items()},
         consistent={n: share(x, consistent[n]) for n, x in open_classes.items()},
         moment_matching_error=_mean_error(joint, alone, config),
-        readout_error=histories.readout_error(
-            key, config, bank, fusion.classes, fusion.class_probabilities
-        ),
+        readout_error=readout_error(key, config, bank, fusion.classes, fusion.class_probabilities),
         fusion=_fusion_metrics(fusion, bank, alone),
     )
 
@@ -142,9 +176,9 @@ def moment_matching_error(belief: Belief, components: Belief) -> Float[Array, ""
     Mean over the dimensions of `|mean difference|`, in matched standard deviations, plus
     `|log(std ratio)|`.
     """
-    mean, std = gaussian.moment_match(components.mean, components.std)
-    shift = jnp.abs(belief.mean - mean) / std
-    return jnp.mean(shift + jnp.abs(jnp.log(belief.std / std)))
+    target = gaussian.moment_match(components)
+    shift = jnp.abs(belief.mean - target.mean) / target.std
+    return jnp.mean(shift + jnp.abs(jnp.log(belief.std / target.std)))
 
 
 def _mean_error(joint: Belief, alone: list[Belief], config: Config) -> Float[Array, ""]:
@@ -164,22 +198,20 @@ def _fusion_metrics(
     fusion: Fusion, bank: Samples, alone: list[Belief]
 ) -> dict[str, Float[Array, ""] | None]:
     """Quality of beliefs after a look by one modality and then by another."""
-    is_right, distances, widths = [], [], []
-    shown = jax.vmap(jax.vmap(lambda b: readout.nearest_class(b, fusion.classes.mean)))
+    found: dict[str, list[jax.Array]] = {"accuracy": [], "mean_error": [], "std_error": []}
+    means = fusion.classes.mean
     for first, second in itertools.permutations(range(len(bank)), 2):
         seen = jnp.arange(len(bank)) == first
         update = lambda old, new: fusion.update(old, seen, new, second)  # noqa: B023, E731
         fused = jax.vmap(jax.vmap(update))(alone[first], bank[second])
         both = _beliefs(fusion, bank, (first, second))
-        is_right.append(shown(fused) == jnp.arange(len(bank[0]))[:, None])
-        distances.append(jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1))
-        widths.append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))
+        distances = jnp.linalg.norm(means[None, None] - fused.mean[:, :, None], axis=-1)
+        found["accuracy"].append(distances.argmin(-1) == jnp.arange(len(means))[:, None])
+        off = jnp.linalg.norm((fused.mean - both.mean) / both.std, axis=-1)
+        found["mean_error"].append(off)
+        found["std_error"].append(jnp.mean(jnp.abs(jnp.log(fused.std / both.std)), axis=-1))
     # A single modality has nothing to fuse.
-    return {
-        "accuracy": jnp.mean(jnp.array(is_right)) if is_right else None,
-        "mean_error": jnp.mean(jnp.array(distances)) if distances else None,
-        "std_error": jnp.mean(jnp.array(widths)) if widths else None,
-    }
+    return {name: jnp.mean(jnp.array(values)) if values else None for name, values in found.items()}
 
 
 def beliefs(
@@ -213,7 +245,7 @@ def beliefs(
 
     def history(drawn: tuple[Key, jax.Array]):
         start = fusion.prior, exact.prior, jnp.zeros(len(bank), bool)
-        return jax.lax.scan(look, start, histories.draw(drawn[0], bank, drawn[1]))[1]
+        return jax.lax.scan(look, start, draw_history(drawn[0], bank, drawn[1]))[1]
 
     truth = jnp.arange(num_histories) % number
     # All at once would take a third of a run's memory. Groups of one size are traced once.
@@ -230,10 +262,67 @@ def beliefs(
 
     (nll, accuracy), (bayes_nll, bayes_accuracy) = measured(found), measured(log_posterior)
     return {
-        "looks": 1 + jnp.arange(histories.LOOKS),
+        "looks": 1 + jnp.arange(_LOOKS),
         "nll": nll,
         "bayes_nll": bayes_nll,
         "accuracy": accuracy,
         "bayes_accuracy": bayes_accuracy,
         "doubt_correlation": jnp.corrcoef(norms.reshape(-1), entropy.reshape(-1))[0, 1],
     }
+
+
+def draw_history(
+    key: Key, bank: Samples, true_class: Int[Array, ""]
+) -> tuple[Int[Array, " T"], tuple[Float[Array, "T D_m"], ...]]:
+    """Draws a history of looks at a PoI.
+
+    Returns:
+      `[T]` int32 modality of each look, and for each modality `[T, D_m]` features, of which only
+      those of this modality count.
+    """
+    modality_key, *row_keys = jax.random.split(key, 1 + len(bank))
+    modalities = jax.random.randint(modality_key, (_LOOKS,), 0, len(bank))
+    looks = tuple(
+        x[true_class, jax.random.randint(k, (_LOOKS,), 0, x.shape[1])]
+        for x, k in zip(bank, row_keys, strict=True)
+    )
+    return modalities, looks
+
+
+def readout_error(
+    key: Key,
+    config: Config,
+    bank: Samples,
+    classes: Belief,
+    read: Callable[[Belief], Float[Array, " C"]],
+    number: int = 1024,
+) -> Float[Array, ""]:
+    """Nats that class probabilities lose when a belief holds them.
+
+    Mean divergence after the number of looks where it is largest. Exact Bayes gives the
+    probabilities after each look of random histories; the belief with the moments of their mixture
+    is as good as a belief can be.
+
+    Args:
+      key: of the histories.
+      config: all settings.
+      bank: looks at every class.
+      classes: `[C, D]` mean joint posterior of each class.
+      read: class probabilities of a belief.
+      number: of histories; static.
+    """
+    exact = make_bayes(config)
+
+    def history(key: Key, true_class: jax.Array) -> jax.Array:
+        def look(log_posterior: jax.Array, drawn):
+            modality, features = drawn
+            update = lambda m: exact.update(log_posterior, features[m], m)  # noqa: E731
+            after = call(update, modality, len(bank))
+            held = readout.mixture(classes, jnp.exp(after))
+            return after, readout.divergence(jnp.exp(after), read(held))
+
+        return jax.lax.scan(look, exact.prior, draw_history(key, bank, true_class))[1]
+
+    truth = jnp.arange(number) % len(classes.mean)
+    lost = jax.vmap(history)(jax.random.split(key, number), truth)
+    return jnp.max(jnp.mean(lost, axis=0))

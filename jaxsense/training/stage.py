@@ -13,6 +13,7 @@ from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitConfig, FitState, Problem
 from jaxsense.core.types import Key, pytree
+from jaxsense.vae import jmvae, leave_one_out
 
 _MAX_CHUNKS = 20
 
@@ -36,12 +37,6 @@ class Progress:
     metrics: dict[str, Float[Array, "..."]]
 
 
-def _state(config: Config, state: Output, **_: Output) -> Output:
-    """`finish` of a stage whose output is its state."""
-    del config
-    return state
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stage:
     """One stage of a training.
@@ -62,7 +57,7 @@ class Stage:
     name: str
     begin: Callable[..., Output]
     advance: Callable[..., tuple[Output, Progress]] | None = None
-    finish: Callable[..., Output] = _state
+    finish: Callable[..., Output] = lambda config, state, **inputs: state
     steps: int = 0
     chunks: int = 0
     is_optional: bool = False
@@ -137,21 +132,17 @@ def fit_stage(
 
 
 def restarts(
-    config: Config,
-    *,
-    untrained: Callable[..., tuple[Output, Params]],
-    problem: Callable[..., Problem[Output]],
+    config: Config, problem: Callable[..., jmvae.Fitting | leave_one_out.Fitting]
 ) -> list[Stage]:
     """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk."""
-
-    def trained(
-        config: Config, model: Output, fit: FitState, **inputs: Output
-    ) -> tuple[Params, jax.Array]:
-        del config, model, inputs
-        return fit.params, fit.loss
-
     number = config.jmvae.restarts
-    stage = fit_stage("", config.jmvae, untrained=untrained, problem=problem, trained=trained)
+    stage = fit_stage(
+        "",
+        config.jmvae,
+        untrained=lambda key, config, **inputs: ((), problem(config, **inputs).init(key)),
+        problem=lambda config, _, **inputs: problem(config, **inputs),
+        trained=lambda config, _, fit, **inputs: (fit.params, fit.loss),
+    )
     stage = dataclasses.replace(stage, shares="jmvae", is_optional=number > 1)
     return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(number)]
 

@@ -6,6 +6,7 @@ and stops if asked to.
 """
 
 import contextlib
+import functools
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -14,21 +15,23 @@ from jaxtyping import Array, Bool
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.models import Models, make_agent, make_models
+from jaxsense.models import Models, make_agent, make_jmvae, make_models, make_scan_jmvae
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import (
-    agents,
-    comparison,
-    detections,
-    fusions,
-    jmvaes,
-    measures,
-    repeats,
-    scans,
-    surveys,
+from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans, surveys
+from jaxsense.training.detections import Detections
+from jaxsense.training.scans import Views
+from jaxsense.training.stage import (
+    Drive,
+    Output,
+    Progress,
+    Stage,
+    is_finite,
+    key_of,
+    restarts,
+    scan,
 )
-from jaxsense.training.stage import Drive, Output, Progress, Stage, is_finite, key_of, scan
+from jaxsense.vae import jmvae, leave_one_out
 
 
 @pytree
@@ -64,8 +67,13 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
     known = {"detections": detected}
     drive(Stage("detector_metrics", measures.detector_metrics), **known)
 
-    fusion = fusions.train(drive, config, params=params, classes=classes, **known)
-    known["fusion"] = fusion
+    if config.jmvae.fusion == "in_place":
+        fit = Stage("fusion", jmvaes.fit_in_place)
+        known["fusion"] = drive(fit, params=params, classes=classes, **known)
+    else:
+        # A stage of its own, whose name determines its key.
+        fitted = drive(jmvaes.filter_stage(config), classes=classes, **known)
+        known["fusion"] = drive(Stage("fusion", lambda key, config, fusion: fusion), fusion=fitted)
     drive(Stage("latent_space", measures.latent_space), **known)
     solve = Stage("look_values", agents.look_values)
     values = drive(solve, classes=classes, detections=detected)
@@ -85,16 +93,20 @@ def _learn_from_detections(
 ) -> tuple[Output, Output, Output, Output]:
     """Detectors, parameters of the JMVAE, class beliefs and detections; see `scans`."""
     del scenes
+
+    def problem(config: Config, *, detections: Detections) -> jmvae.Fitting:
+        return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
+
     given = {"surveys": surveys, "examples": examples}
     stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
     trained = tuple(drive(stage, **given) for stage in stages)
     detected = drive(Stage("detections", detections.detect), surveys=surveys, trained=trained)
-    each = tuple(drive(stage, detections=detected) for stage in jmvaes.restarts(config))
+    each = tuple(drive(stage, detections=detected) for stage in restarts(config, problem))
     choose = Stage("best_jmvae", jmvaes.best)
     params = drive(choose, restarts=each, detections=detected)
     average = Stage("class_beliefs", jmvaes.class_beliefs)
     classes = drive(average, params=params, detections=detected)
-    drive(repeats.novelty_stage(arena, config), trained=trained)
+    drive(_novelty(arena), trained=trained)
     return trained, params, classes, detected
 
 
@@ -102,21 +114,28 @@ def _learn_from_scans(
     drive: Drive, config: Config, arena: Arena, *, scenes: Output, surveys: Output, examples: Output
 ) -> tuple[Output, Output, Output, Output]:
     """The same of a JMVAE that learns from scans, and whose encoders serve as detectors."""
+
+    def problem(config: Config, *, views: Views) -> leave_one_out.Fitting:
+        return leave_one_out.Fitting(config.jmvae, views.groups, make_scan_jmvae(config))
+
     seen = drive(Stage("views", scans.views), surveys=surveys)
-    each = tuple(drive(stage, views=seen) for stage in scans.restarts(config))
-    params = drive(Stage("best_jmvae", scans.best), restarts=each)
+    each = tuple(drive(stage, views=seen) for stage in restarts(config, problem))
+    params = drive(Stage("best_jmvae", jmvaes.best), restarts=each)
     learned = {"params": params, "views": seen, "surveys": surveys}
     classes = drive(Stage("class_beliefs", scans.class_beliefs), **learned)
     learned["classes"] = classes
     shown = drive(Stage("shown", scans.shown), **learned)
     stages = [scans.encoder_stage(m, config) for m in range(len(config.modalities))]
     trained = tuple(drive(stage, examples=examples, shown=shown, **learned) for stage in stages)
-    find = Stage("detections", scans.detect)
+    find = Stage("detections", detections.detect)
     detected = drive(find, surveys=surveys, trained=trained, shown=shown)
     drive(Stage("grouped", scans.accuracies), **learned)
-    novelty = repeats.novelty_stage(arena, config, scans.repeated)
-    drive(novelty, trained=trained, scenes=scenes, shown=shown)
+    drive(_novelty(arena), trained=trained, scenes=scenes, shown=shown)
     return trained, params, classes, detected
+
+
+def _novelty(arena: Arena) -> Stage:
+    return Stage("novelty", functools.partial(detections.learn_novelty, arena=arena))
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:

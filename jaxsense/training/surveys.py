@@ -65,18 +65,23 @@ def num_scenes(config: Config) -> tuple[int, int, int, int]:
     num_empty = -(-num_train // _SHARE_OF_EMPTY)
     num_for_starts = num_starts(config) * config.jmvae.num_together
     parts = num_train, max(num_bank, num_for_starts), num_held_out
-    num_train, num_bank, num_held_out = (_whole(number, config) for number in parts)
+    # Whole groups of scenes that show the same PoIs.
+    together = config.jmvae.num_together
+    num_train, num_bank, num_held_out = (-(-number // together) * together for number in parts)
     return num_train, num_bank, num_held_out, num_empty
-
-
-def _whole(number: int, config: Config) -> int:
-    """A number of scenes in whole groups that show the same PoIs."""
-    return -(-number // config.jmvae.num_together) * config.jmvae.num_together
 
 
 def held_out_per_class(config: Config) -> int:
     """Number of held-out looks at each class."""
     return -(-config.detector.num_held_out // len(config.arena.classes))
+
+
+def num_training(config: Config) -> int:
+    """Looks by each sensor to train its detector with, in whole groups; the others calibrate it."""
+    together, num_pois = config.jmvae.num_together, config.arena.num_pois
+    if together == 1:
+        return config.detector.num_training(num_scenes(config)[0] * num_pois)
+    return together * num_pois * config.detector.num_training(num_scenes(config)[0] // together)
 
 
 def num_starts(config: Config) -> int:

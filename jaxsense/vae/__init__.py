@@ -1,17 +1,15 @@
 """Detectors, the joint multi-modal VAE, and fusion in its latent space."""
 
-from jaxsense.core.types import Fusion as Fusion
-from jaxsense.vae.bayes import bayes_update as bayes_update
-from jaxsense.vae.bayes import product_of_experts as product_of_experts
 from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import Looks as Looks
 from jaxsense.vae.detectors import features as features
 from jaxsense.vae.detectors import retrain as retrain
-from jaxsense.vae.filter import Filter as Filter
+from jaxsense.vae.fusion import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace
 from jaxsense.vae.fusion import fuse as fuse
 from jaxsense.vae.fusion import prior as prior
+from jaxsense.vae.gaussian import product_of_experts as product_of_experts
 from jaxsense.vae.jmvae import Jmvae as Jmvae
 from jaxsense.vae.jmvae import decode as decode
 from jaxsense.vae.jmvae import encode as encode

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import DetectorConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Key, Reliability, product, pytree
+from jaxsense.core.types import Key, product, pytree
 
 _NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
 _MIN_PROBABILITY = 1e-9  # whose logarithm counts in a search
@@ -24,8 +24,6 @@ _MAX_DEPTHS = 2.5
 _MAX_LOST = 0.01  # share of the looks at PoIs
 _MAX_PASSED = 0.002  # share of the looks at nothing, if few looks at PoIs are lost for it
 _FACTORS = np.geomspace(1 / 16, 16, 513, dtype=np.float32)  # on logits, that are tried
-_BINS = 15
-_IS_WHOLE = "must be finite; leave out what was not recorded"
 _Rows = tuple[Int[Array, "... B"], Int[Array, "... C"]]
 
 
@@ -63,7 +61,7 @@ class Detection:
 
     Attributes:
       is_known: `[]` whether the detector can judge the look: all readings of a window are there,
-        and, from `Models.detect`, it has learned from looks like this one, see `sim.Domain`.
+        and, from `Models.detect`, it has learned from looks like this, see `sim.windows.Domain`.
       is_there: `[]` whether the window shows its PoI; False of a look that is not known.
       features: `[D_m]` probabilities of the labels, all equal if it does not.
     """
@@ -331,7 +329,8 @@ def retrain(
         raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
     shown, labels = jax.tree.map(jnp.asarray, (shown, labels))
     checks.require_shape("windows", shown.windows, (None, detector.window_size))
-    checks.require_finite("windows", shown.windows, _IS_WHOLE)
+    reason = "must be finite; leave out what was not recorded"
+    checks.require_finite("windows", shown.windows, reason)
     chex.assert_shape([labels, shown.distances], (len(shown.windows),))
     checks.require_index("labels", labels, detector.num_labels)
     number = config.num_training(len(labels))
@@ -339,21 +338,22 @@ def retrain(
         expected = f"must leave some of {len(labels)} looks to train with, and some to judge by"
         raise ValueError(f"config.calibration = {config.calibration}: {expected}")
     problem = Relabelling(config, detector, shown, labels, number)
-    fit, _ = supervised.fit(key, supervised.start(detector.params, config), problem, config.steps)
+    before = detector.params["params"][problem.last]
+    fit, _ = supervised.fit(key, supervised.start(before, config), problem, config.steps)
 
     def moved(share: jax.Array) -> Params:
-        return jax.tree.map(lambda old, new: old + share * (new - old), detector.params, fit.params)
+        return jax.tree.map(lambda old, new: old + share * (new - old), before, fit.params)
 
     kept, shares = jnp.arange(number, len(labels)), jnp.linspace(0.0, 1.0, 21)
     losses = jax.lax.map(lambda share: problem.loss(moved(share), kept, fit.step), shares)
     checks.require_finite("loss of retrained detectors", losses, "must be finite; retrain slower")
     best = jnp.where(jnp.isfinite(losses).all(), shares[jnp.argmin(losses)], jnp.nan)
-    return dataclasses.replace(detector, params=moved(best))
+    return problem.retrained(moved(best))
 
 
 @pytree
 class Relabelling:
-    """Problem of fitting the labels' outputs of a trained detector, see `retrain`."""
+    """Problem of fitting the last layer of a trained detector, see `retrain`."""
 
     config: DetectorConfig
     detector: Classifier
@@ -361,17 +361,24 @@ class Relabelling:
     labels: Int[Array, " S"]
     number: int = struct.field(pytree_node=False)
 
+    @property
+    def last(self) -> str:
+        """Name of the last layer."""
+        return f"Dense_{len(self.detector.hidden)}"
+
+    def retrained(self, layer: Params) -> Classifier:
+        """The detector with another last layer."""
+        layers = {**self.detector.params["params"], self.last: layer}
+        return dataclasses.replace(self.detector, params={"params": layers})
+
     def draw(self, key: Key, number: int) -> Int[Array, "{number} B"]:
         """Rows of the looks to train with, see `Problem.draw`."""
         return jax.random.randint(key, (number, self.config.batch), 0, self.number)
 
     def loss(self, params: Params, drawn: Int[Array, " B"], step: Array) -> Float[Array, ""]:
-        """Mean cross-entropy of the labels, whose gradient moves the last layer alone."""
+        """Mean cross-entropy of the labels."""
         del step
-        last = f"Dense_{len(self.detector.hidden)}"
-        layers = {**jax.lax.stop_gradient(params["params"]), last: params["params"][last]}
-        detector = dataclasses.replace(self.detector, params={"params": layers})
-        found = detector.of(jax.tree.map(lambda x: x[drawn], self.shown))[:-1]
+        found = self.retrained(params).of(jax.tree.map(lambda x: x[drawn], self.shown))[:-1]
         cross_entropy = optax.softmax_cross_entropy_with_integer_labels
         return cross_entropy(found, self.labels[drawn], 0).mean()
 
@@ -388,36 +395,3 @@ def sharpness(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Ar
 def _best_factor(loss: Callable[[Float[Array, ""]], Float[Array, ""]]) -> Float[Array, ""]:
     """The factor of the lowest loss, of 513 from 1/16 to 16."""
     return jnp.asarray(_FACTORS)[jnp.argmin(jax.lax.map(loss, jnp.asarray(_FACTORS)))]
-
-
-def negative_log_likelihood(
-    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
-) -> Float[Array, ""]:
-    """Mean of `-log p(label)` in nats."""
-    chex.assert_shape(probabilities, (len(labels), None))
-    right = jnp.take_along_axis(probabilities, labels[:, None], axis=1)[:, 0]
-    return -jnp.mean(jnp.log(jnp.maximum(right, 1e-12)))
-
-
-def calibration_error(
-    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
-) -> Float[Array, ""]:
-    """Expected calibration error of the most likely labels (Guo et al. 2017, Sec. 2).
-
-    The difference between mean confidence and accuracy in a bin of `reliability`, averaged over
-    all looks.
-    """
-    found = reliability(probabilities, labels)
-    share = found.looks / len(labels)
-    return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
-
-
-def reliability(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
-    """Points of a reliability diagram with fifteen bins of equal width."""
-    chex.assert_shape(probabilities, (len(labels), None))
-    confidence = jnp.max(probabilities, axis=1)
-    is_right = jnp.argmax(probabilities, axis=1) == labels
-    bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
-    of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
-    sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
-    return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])

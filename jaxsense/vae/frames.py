@@ -4,8 +4,6 @@ A network that learns from scans without labels uses its latents first for what 
 and in which direction the PoI is, and how bright the light. A frame takes these out of a window.
 """
 
-from typing import Protocol
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,16 +24,17 @@ _FEWEST = 3  # beams, fewer of which show no profile
 _DARK = 0.03  # keeps chromaticity finite
 
 
-class Frame(Protocol):
-    """How a network sees the windows of one sensor; a frozen pytree."""
+@pytree
+class Frame:
+    """How a network sees the windows of one sensor; here as they are."""
 
     def __call__(self, window: Float[Array, " F"]) -> Float[Array, " G"]:
         """The numbers that the network reads in a window, see `sim.windows.as_window`."""
-        ...
+        return window
 
 
 @pytree
-class Profile:
+class Profile(Frame):
     """Depth over lateral position around a PoI's middle, from a window of distances.
 
     Attributes:
@@ -78,7 +77,7 @@ class Profile:
 
 
 @pytree
-class Chromaticity:
+class Chromaticity(Frame):
     """Shares of red, green and blue in the brightness of each pixel, from a window of RGB.
 
     The mean brightness of the window is added to that of the pixel: shares of dark pixels are
@@ -93,15 +92,6 @@ class Chromaticity:
         return (pixels / total).reshape(-1)
 
 
-@pytree
-class Plain:
-    """The window as it is."""
-
-    def __call__(self, window: Float[Array, " F"]) -> Float[Array, " F"]:
-        """See `Frame`."""
-        return window
-
-
 def make(
     angles: Float[np.ndarray, " W"],
     channels: int,
@@ -112,7 +102,7 @@ def make(
     """The frame for windows of a sensor.
 
     Args:
-      angles: `[W]` of the rays in the middle of its view, in radians.
+      angles: of the rays in the middle of its view, in radians.
       channels: numbers in the reading of one ray.
       measures_distance: as in `Sensor`.
       extent: radius of the circle that holds a PoI, in metres.
@@ -123,7 +113,7 @@ def make(
         pitch = jnp.abs(apart[1] - apart[0])
         ahead = jnp.sin(jnp.maximum(_AHEAD + bearing_error, 1.01 * pitch))
         return Profile(jnp.sin(apart), jnp.cos(apart), ahead, jnp.float32(extent))
-    return Chromaticity() if channels == 3 else Plain()
+    return Chromaticity() if channels == 3 else Frame()
 
 
 @pytree

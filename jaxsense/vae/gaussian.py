@@ -5,7 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsense.core import checks
+from jaxsense.core.types import Belief
 
+_MIN_PRECISION = 1e-6
 _Columns = Float[Array, "D ..."]
 
 
@@ -50,17 +52,34 @@ def product(
     return jnp.sum(precisions * means, axis=0) / precision, -jnp.log(precision)
 
 
-def moment_match(
-    mean: Float[Array, "K D"], std: Float[Array, "K D"]
-) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """Mean and standard deviation of an equal mixture of K diagonal Gaussians.
+def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Belief:
+    """Multiplies a `[D]` belief by the posterior of one more look and divides by their prior.
 
-    The Gaussian with these moments minimises `E KL(component || q)` over diagonal Gaussians q, the
-    goal of a JMVAE's uni-modal encoders.
+    Args:
+      belief: before the look.
+      posterior: `q(z | x)` given this look alone.
+      prior: contained in both.
+
+    Returns:
+      Normalised product, with a lower bound on its precision.
+
+    Raises:
+      ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
-    checks.require_positive("std", std)
-    chex.assert_rank(mean, 2)
-    chex.assert_equal_shape([mean, std])
-    checks.require_number("number of components", len(mean))
-    variance = jnp.mean(std**2, axis=0) + jnp.var(mean, axis=0)
-    return jnp.mean(mean, axis=0), jnp.sqrt(variance)
+    for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
+        checks.require_belief(name, each, None if each is belief else len(belief.mean))
+    of_belief, of_posterior, of_prior = (x.std**-2 for x in (belief, posterior, prior))
+    precision = jnp.maximum(of_belief + of_posterior - of_prior, _MIN_PRECISION)
+    total = of_belief * belief.mean + of_posterior * posterior.mean - of_prior * prior.mean
+    return Belief(total / precision, precision**-0.5)
+
+
+def moment_match(parts: Belief) -> Belief:
+    """Moments of an equal mixture of `[K, D]` diagonal Gaussians, `[D]`.
+
+    The Gaussian with these moments minimises `E KL(part || q)` over diagonal Gaussians q, the goal
+    of a JMVAE's uni-modal encoders.
+    """
+    chex.assert_rank(parts.mean, 2)
+    variance = jnp.mean(parts.std**2, axis=0) + jnp.var(parts.mean, axis=0)
+    return Belief(jnp.mean(parts.mean, axis=0), jnp.sqrt(variance))

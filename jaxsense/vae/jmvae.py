@@ -11,6 +11,7 @@ import itertools
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
@@ -49,19 +50,15 @@ class Jmvae:
     def __post_init__(self):
         for name in ("modalities", "feature_sizes", "hidden"):
             checks.require_type(name, getattr(self, name), tuple, "which JAX can hash")
-        if not self.modalities:
-            raise ValueError("modalities = (): must name one or more modalities")
         checks.require_one_each("feature_sizes", self.feature_sizes, self.modalities)
-        if len(set(self.modalities)) < len(self.modalities):
-            raise ValueError(f"modalities = {self.modalities}: must name none twice")
-        if len(set(map(self.encoder_name, self.subsets))) < len(self.subsets):
-            raise ValueError(f"modalities = {self.modalities}: must have no +, which joins names")
-        checks.require_number("latent_size", self.latent_size)
+        encoders = {self.encoder_name(subset) for subset in self.subsets}
+        if not self.modalities or len(encoders) < len(self.subsets):
+            expected = "must be one name or more, none twice, and none with a +, which joins names"
+            raise ValueError(f"modalities = {self.modalities}: {expected}")
         if self.max_subset is not None:
             checks.require_number("max_subset", self.max_subset)
-        for name in ("feature_sizes", "hidden"):
-            for size in getattr(self, name):
-                checks.require_number(name, size)
+        for size in (*self.feature_sizes, *self.hidden, self.latent_size):
+            checks.require_number("size of features, latents or a layer", size)
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
@@ -70,6 +67,15 @@ class Jmvae:
         largest = number - 1 if self.max_subset is None else min(self.max_subset, number - 1)
         sizes = (*range(1, largest + 1), number)
         return tuple(s for size in sizes for s in itertools.combinations(range(number), size))
+
+    @property
+    def encoder(self) -> MLP:
+        """The network from features to the mean and log-variance of a posterior."""
+        return MLP(self.hidden, 2 * self.latent_size)
+
+    def decoder(self, modality: int) -> MLP:
+        """The network from a latent to features."""
+        return MLP(self.hidden, self.feature_sizes[modality])
 
     def encoder_name(self, subset: tuple[int, ...]) -> str:
         """Name of a subset's encoder, for example "camera+lidar"."""
@@ -84,22 +90,21 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
     """
     checks.require_positive("scale", scale)
 
-    def network(key: Key, inputs: int, outputs: int) -> Params:
-        shape = MLP(model.hidden, outputs)
-        return jax.tree.map(lambda x: scale * x, networks.init(key, shape, inputs))
+    def scaled(key: Key, network: MLP, inputs: int) -> Params:
+        return jax.tree.map(lambda x: scale * x, networks.init(key, network, inputs))
 
     encoder_key, decoder_key = jax.random.split(key)
     encoder_keys = jax.random.split(encoder_key, len(model.subsets))
     decoder_keys = jax.random.split(decoder_key, len(model.modalities))
     encoders = {
-        model.encoder_name(subset): network(
-            k, sum(model.feature_sizes[m] for m in subset), 2 * model.latent_size
+        model.encoder_name(subset): scaled(
+            k, model.encoder, sum(model.feature_sizes[m] for m in subset)
         )
         for k, subset in zip(encoder_keys, model.subsets, strict=True)
     }
     decoders = {
-        name: network(k, model.latent_size, size)
-        for k, name, size in zip(decoder_keys, model.modalities, model.feature_sizes, strict=True)
+        name: scaled(decoder_keys[m], model.decoder(m), model.latent_size)
+        for m, name in enumerate(model.modalities)
     }
     return {"encoders": encoders, "decoders": decoders}
 
@@ -138,9 +143,8 @@ def _encode(
 ) -> tuple[Array, Array]:
     """`[D]` mean and log-variance from `[D_m]` features, or `[D, B]` from `[D_m, B]`."""
     joined = jnp.concatenate([x for m, x in enumerate(features) if m in subset and x is not None])
-    network = MLP(model.hidden, 2 * model.latent_size)
-    output = networks.apply(network, params["encoders"][model.encoder_name(subset)], joined)
-    mean, log_var = jnp.split(output, 2)
+    of_subset = params["encoders"][model.encoder_name(subset)]
+    mean, log_var = jnp.split(networks.apply(model.encoder, of_subset, joined), 2)
     return mean, log_var
 
 
@@ -154,8 +158,8 @@ def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[A
 def _decode(params: Params, model: Jmvae, z: jax.Array) -> tuple[jax.Array, ...]:
     """`[D_m]` from `[D]` latents, or `[D_m, B]` from `[D, B]`."""
     return tuple(
-        networks.apply(MLP(model.hidden, size), params["decoders"][name], z)
-        for name, size in zip(model.modalities, model.feature_sizes, strict=True)
+        networks.apply(model.decoder(m), params["decoders"][name], z)
+        for m, name in enumerate(model.modalities)
     )
 
 
@@ -163,57 +167,6 @@ def posterior(params: Params, model: Jmvae, features: Features) -> Belief:
     """The posterior `q(z | present features)` as a belief, see `encode`."""
     mean, log_var = encode(params, model, features)
     return Belief(mean, jnp.exp(0.5 * log_var))
-
-
-@checks.typed
-def loss(
-    key: Key,
-    params: Params,
-    model: Jmvae,
-    features: tuple[Float[Array, "_"], ...],
-    *,
-    alpha: float | jax.Array,
-    beta: float | jax.Array,
-    reconstruction_weights: tuple[float, ...],
-) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Loss of one example, the negative JMVAE-kl objective.
-
-    Suzuki et al. 2017, Sec. 3.3:
-    `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
-    where z is one reparameterised draw from `q(z|all)`, p a Gaussian of unit variance without its
-    constant, and s every proper subset of the modalities that has an encoder. A weight w_m is the
-    same as a variance of 1 / w_m.
-
-    Args:
-      key: of the draw.
-      params: from `init`.
-      model: the shape.
-      features: `[D_m]` of every modality.
-      alpha: weight of the divergences to the subsets' encoders.
-      beta: weight of the divergence to the prior.
-      reconstruction_weights: w_m.
-
-    Returns:
-      Loss, and its parts: `reconstruction`, which is weighted, `prior` and `subsets`.
-
-    Raises:
-      ValueError: if a modality's features or its weight is missing.
-    """
-    checks.require_one_each("features", features, model.modalities)
-    checks.require_one_each("reconstruction_weights", reconstruction_weights, model.modalities)
-    for name, size, x in zip(model.modalities, model.feature_sizes, features, strict=True):
-        checks.require_shape(f"features of {name}", x, (size,))
-    noise = jax.random.normal(key, (model.latent_size, 1))
-    total, parts = losses(
-        noise,
-        params,
-        model,
-        tuple(x[:, None] for x in features),
-        alpha=alpha,
-        beta=beta,
-        reconstruction_weights=reconstruction_weights,
-    )
-    return total[0], {name: part[0] for name, part in parts.items()}
 
 
 def losses(
@@ -226,16 +179,25 @@ def losses(
     beta: float | jax.Array,
     reconstruction_weights: tuple[float, ...],
 ) -> tuple[Float[Array, " B"], dict[str, Float[Array, " B"]]]:
-    """Losses and their parts of a batch, the last axis of all arrays; see `loss`.
+    """Negative JMVAE-kl objective of each example, the last axis of all arrays.
+
+    Suzuki et al. 2017, Sec. 3.3:
+    `-E[sum_m w_m log p(x_m|z)] + beta KL(q(z|all) || N(0, I)) + alpha sum_s KL(q(z|all) || q(z|s))`
+    where z is one reparameterised draw from `q(z|all)`, p a Gaussian of unit variance without its
+    constant, and s every proper subset of the modalities that has an encoder. A weight w_m is the
+    same as a variance of 1 / w_m.
 
     Args:
-      noise: `[D, B]` standard normal draws, for z.
+      noise: standard normal draws, for z.
       params: from `init`.
       model: the shape.
-      features: `[D_m, B]` of every modality.
-      alpha: see `loss`.
-      beta: see `loss`.
-      reconstruction_weights: see `loss`.
+      features: of every modality.
+      alpha: weight of the divergences to the subsets' encoders.
+      beta: weight of the divergence to the prior.
+      reconstruction_weights: w_m.
+
+    Returns:
+      Losses, and their parts: `reconstruction`, which is weighted, `prior` and `subsets`.
     """
     batch = noise.shape[-1]
     for x, size in zip(features, model.feature_sizes, strict=True):
@@ -264,6 +226,10 @@ class Fitting:
     config: JmvaeConfig
     bank: Samples
     model: Jmvae = struct.field(pytree_node=False)
+
+    def init(self, key: Key) -> Params:
+        """Random parameters to start from."""
+        return init(key, self.model)
 
     def draw(self, key: Key, number: int) -> Drawn:
         """Noise, and features from the bank, see `Problem.draw`."""
@@ -339,11 +305,8 @@ def _require_bank(bank: Samples, model: Jmvae) -> None:
     checks.require_one_each("bank", bank, model.modalities)
     for name, size, features in zip(model.modalities, model.feature_sizes, bank, strict=True):
         of_modality = f"bank of {name}"
-        checks.require_shape(of_modality, features, (None, None, size))
-        checks.require_shape(of_modality, features, (len(bank[0]), None, size))
-        if not features.size:
-            shape = features.shape
-            raise ValueError(f"{of_modality} has the shape {shape}: must hold one row or more")
+        checks.require_shape(of_modality, features, (*np.shape(bank[0])[:1], None, size))
+        checks.require_number(f"rows in the {of_modality}", len(features) * features.shape[1])
         checks.require_finite(of_modality, features)
     if len(bank[0]) == 1 < min(len(bank), bank[0].shape[1]):
         expected = "must be two or more; give rows [N, D] as x[:, None], not x[None]"
@@ -377,7 +340,7 @@ def log_likelihood(
     bring it closer. For the likelihood of features given others, subtract that of the others.
 
     Args:
-      key: random key.
+      key: of the draws.
       params: from `train`.
       model: the shape.
       features: for each modality `[D_m]`, or None where it is missing.

@@ -23,7 +23,7 @@ from jaxsense.core.types import Belief, Key, product, pytree
 from jaxsense.vae import detectors, gaussian
 from jaxsense.vae.detectors import Classifier
 from jaxsense.vae.frames import Scaling
-from jaxsense.vae.jmvae import annealed_beta
+from jaxsense.vae.jmvae import Jmvae, annealed_beta
 from jaxsense.vae.readout import Readout
 
 _EMBEDDING = 64  # numbers that a network finds in a look
@@ -39,73 +39,50 @@ Groups = tuple[Float[Array, "P K _"], ...]
 """For each modality `[P, K, F_m]`: K looks at each of P PoIs, in the frame of the sensor."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Shape:
-    """Sizes of the networks; hashable, static under `jit`.
-
-    Attributes:
-      modalities: names.
-      inputs: F_m of each modality.
-      latent_size: D.
-      hidden: sizes of the hidden layers of the encoders and decoders.
-    """
-
-    modalities: tuple[str, ...]
-    inputs: tuple[int, ...]
-    latent_size: int
-    hidden: tuple[int, ...]
-
-    @property
-    def encoder(self) -> MLP:
-        """The network from one look to the mean and log-variance of its posterior."""
-        return MLP(self.hidden, 2 * self.latent_size)
-
-    @property
-    def embedding(self) -> MLP:
-        """The network from one look to what the posterior of several looks reads of it."""
-        return MLP(self.hidden[:1], _EMBEDDING)
-
-    @property
-    def joint(self) -> MLP:
-        """The network from the means of these to the posterior of all looks."""
-        return MLP(self.hidden[-1:], 2 * self.latent_size)
-
-    def decoder(self, modality: int) -> MLP:
-        """The network from a latent to one look."""
-        return MLP(self.hidden, self.inputs[modality])
-
-
-def init(key: Key, shape: Shape) -> Params:
+def init(key: Key, model: Jmvae) -> Params:
     """Random parameters, `{"encoders": {NAME: ...}, "embeddings", "decoders", "joint"}`."""
-    joint_key, *keys = jax.random.split(key, 1 + 3 * len(shape.inputs))
-    each = list(zip(shape.modalities, shape.inputs, strict=True))
-    parts = {"encoders": shape.encoder, "embeddings": shape.embedding}
-    rows = iter(keys)
-    params: dict[str, Params] = {
-        part: {name: networks.init(next(rows), network, size) for name, size in each}
-        for part, network in parts.items()
+    number = len(model.modalities)
+    joint_key, *keys = jax.random.split(key, 1 + 3 * number)
+
+    def of_each(keys: list[Key], network: MLP) -> Params:
+        each = zip(model.modalities, keys, model.feature_sizes, strict=True)
+        return {name: networks.init(key, network, size) for name, key, size in each}
+
+    decoders = {
+        name: networks.init(keys[2 * number + m], model.decoder(m), model.latent_size)
+        for m, name in enumerate(model.modalities)
     }
-    params["decoders"] = {
-        name: networks.init(next(rows), shape.decoder(m), shape.latent_size)
-        for m, name in enumerate(shape.modalities)
+    return {
+        "encoders": of_each(keys[:number], model.encoder),
+        "embeddings": of_each(keys[number : 2 * number], _embedding(model)),
+        "decoders": decoders,
+        "joint": networks.init(joint_key, _joint(model), number * _EMBEDDING),
     }
-    params["joint"] = networks.init(joint_key, shape.joint, _EMBEDDING * len(each))
-    return params
 
 
-def posterior(params: Params, shape: Shape, looks: tuple[Float[Array, "K _"], ...]) -> Belief:
+def _embedding(model: Jmvae) -> MLP:
+    """The network from one look to what the posterior of several looks reads of it."""
+    return MLP(model.hidden[:1], _EMBEDDING)
+
+
+def _joint(model: Jmvae) -> MLP:
+    """The network from the means of these to the posterior of all looks."""
+    return MLP(model.hidden[-1:], 2 * model.latent_size)
+
+
+def posterior(params: Params, model: Jmvae, looks: tuple[Float[Array, "K _"], ...]) -> Belief:
     """Posterior `q(z | all looks)` at one PoI, from `[K, F_m]` looks by each modality."""
     means = [
-        jnp.mean(_embed(params, shape, m, x.T), axis=1, keepdims=True) for m, x in enumerate(looks)
+        jnp.mean(_embed(params, model, m, x.T), axis=1, keepdims=True) for m, x in enumerate(looks)
     ]
-    mean, log_variance = _joint(params, shape, means)
+    mean, log_variance = _of_means(params, model, means)
     return Belief(mean[:, 0], jnp.exp(0.5 * log_variance[:, 0]))
 
 
 def losses(
     noise: Float[Array, "M D B K"],
     params: Params,
-    shape: Shape,
+    model: Jmvae,
     looks: Groups,
     *,
     alpha: Float[Array, ""] | float,
@@ -125,7 +102,7 @@ def losses(
     Args:
       noise: `[M, D, B, K]` standard normal draws.
       params: from `init`.
-      shape: sizes of the networks.
+      model: its shape; the features of a modality are a look in the frame of its sensor.
       looks: K looks, two or more, by each sensor at each of B PoIs.
       alpha: weight of the divergences to the posteriors of fewer looks.
       beta: weight of the divergences from the prior.
@@ -135,9 +112,9 @@ def losses(
     """
     number = looks[0].shape[1]
     columns = [jnp.moveaxis(x, -1, 0) for x in looks]  # [F, B, K]
-    found = [_embed(params, shape, m, x) for m, x in enumerate(columns)]
+    found = [_embed(params, model, m, x) for m, x in enumerate(columns)]
     means = [x.mean(axis=-1) for x in found]
-    mean, log_variance = _joint(params, shape, means)
+    mean, log_variance = _of_means(params, model, means)
     total = beta * gaussian.kl_divergence(mean, log_variance)
     fixed = jax.lax.stop_gradient((mean, log_variance))
 
@@ -150,19 +127,21 @@ def losses(
 
     for m, x in enumerate(columns):
         left = (means[m][..., None] * number - found[m]) / (number - 1)
-        others = [left if i == m else _each(means[i], number) for i in range(len(columns))]
-        mean_of_others, log_variance_of_others = _joint(params, shape, others)
+        others = [jnp.broadcast_to(each[..., None], left.shape) for each in means]
+        others[m] = left
+        mean_of_others, log_variance_of_others = _of_means(params, model, others)
         from_prior = gaussian.kl_divergence(mean_of_others, log_variance_of_others)
         total += beta * jnp.mean(from_prior, axis=-1)
         z = gaussian.sample(noise[m], mean_of_others, log_variance_of_others)
-        decoder = params["decoders"][shape.modalities[m]]
-        error = jnp.sum((x - _columns(shape.decoder(m), decoder, z)) ** 2, axis=0)
+        name = model.modalities[m]
+        decoded = _columns(model.decoder(m), params["decoders"][name], z)
+        error = jnp.sum((x - decoded) ** 2, axis=0)
         # The variance is at its optimum, where its own gradient is 0.
         variance = jax.lax.stop_gradient(jnp.mean(error) / len(x))
         of_looks = jnp.sum(error, axis=-1) / (len(x) * variance) + number * jnp.log(variance)
         total += 0.5 * reconstruction_weights[m] * of_looks
-        total += draws(*_alone(params, shape, m, x))
-    return total + draws(*_joint(params, shape, found))
+        total += draws(*_split(_columns(model.encoder, params["encoders"][name], x)))
+    return total + draws(*_of_means(params, model, found))
 
 
 @pytree
@@ -171,14 +150,18 @@ class Fitting:
 
     config: JmvaeConfig
     groups: Groups
-    shape: Shape = struct.field(pytree_node=False)
+    model: Jmvae = struct.field(pytree_node=False)
+
+    def init(self, key: Key) -> Params:
+        """Random parameters to start from."""
+        return init(key, self.model)
 
     def draw(self, key: Key, number: int) -> Drawn:
         """PoIs and noise, see `Problem.draw`."""
         row_key, noise_key = jax.random.split(key)
         batch, looks = self.config.batch, self.groups[0].shape[1]
         rows = jax.random.randint(row_key, (number, batch), 0, len(self.groups[0]))
-        size = (number, len(self.groups), self.shape.latent_size, batch, looks)
+        size = (number, len(self.groups), self.model.latent_size, batch, looks)
         return rows, jax.random.normal(noise_key, size)
 
     def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
@@ -189,7 +172,7 @@ class Fitting:
         of_each = losses(
             noise,
             params,
-            self.shape,
+            self.model,
             tuple(x[rows] for x in self.groups),
             alpha=self.config.alpha,
             beta=annealed_beta(step, self.config),
@@ -207,22 +190,20 @@ class Encoder:
       params: of the encoder.
       scaling: the frame in which it sees windows.
       presence: a detector of one label, any PoI.
-      classes: `[C, D]` mean joint posterior of each class.
       readout: reads class probabilities from posteriors.
       prior: `[D]` belief before any look.
       sharpness: `[]` factor on the log-probabilities of the labels, see `calibrate`.
-      shape: sizes of the networks.
+      model: shape of the JMVAE.
       label_of_class: label of each class, which names what it has learned.
     """
 
     params: Params
     scaling: Scaling
     presence: Classifier
-    classes: Belief
     readout: Readout
     prior: Belief
     sharpness: Float[Array, ""]
-    shape: Shape = struct.field(pytree_node=False)
+    model: Jmvae = struct.field(pytree_node=False)
     label_of_class: tuple[int, ...] = struct.field(pytree_node=False)
 
     @property
@@ -246,7 +227,7 @@ class Encoder:
         return jnp.concatenate([self.sharpness * self._of_labels(window), odds])
 
     def _of_labels(self, window: Float[Array, " F"]) -> Float[Array, " D_m"]:
-        output = networks.apply(self.shape.encoder, self.params, self.scaling(window))
+        output = networks.apply(self.model.encoder, self.params, self.scaling(window))
         mean, log_variance = _split(output)
         posterior = Belief(mean, jnp.exp(0.5 * log_variance))
         of_class = self.readout.class_probabilities(posterior, self.prior)
@@ -341,18 +322,10 @@ def _split(output: jax.Array) -> tuple[jax.Array, jax.Array]:
     return mean, jnp.clip(log_variance, *_LOG_VARIANCES)
 
 
-def _embed(params: Params, shape: Shape, m: int, x: jax.Array) -> jax.Array:
-    return jax.nn.relu(_columns(shape.embedding, params["embeddings"][shape.modalities[m]], x))
+def _embed(params: Params, model: Jmvae, m: int, x: jax.Array) -> jax.Array:
+    of_modality = params["embeddings"][model.modalities[m]]
+    return jax.nn.relu(_columns(_embedding(model), of_modality, x))
 
 
-def _alone(params: Params, shape: Shape, m: int, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return _split(_columns(shape.encoder, params["encoders"][shape.modalities[m]], x))
-
-
-def _joint(params: Params, shape: Shape, means: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
-    return _split(_columns(shape.joint, params["joint"], jnp.concatenate(means)))
-
-
-def _each(x: jax.Array, number: int) -> jax.Array:
-    """`[..., K]` copies."""
-    return jnp.broadcast_to(x[..., None], (*x.shape, number))
+def _of_means(params: Params, model: Jmvae, means: list[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    return _split(_columns(_joint(model), params["joint"], jnp.concatenate(means)))

@@ -50,11 +50,6 @@ class Novelty:
         """
         return _weight(apart, self.strength[modality], self.length[modality])
 
-    @property
-    def most_near(self) -> float | Float[Array, ""]:
-        """The term `a sum_k ...` of the weight of a look of which just `LEAST_NEW` is new."""
-        return LEAST_NEW**-0.5 - 1
-
     def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
         """`[...]` metres to where at least `LEAST_NEW` of a look is new; 0 where it is already.
 
@@ -65,7 +60,9 @@ class Novelty:
         apart = jnp.minimum(apart, _FAR)
         nearest = jnp.min(apart, axis=-1)
         number = jnp.sum(jnp.exp(0.5 * (nearest[..., None] ** 2 - apart**2) / length**2), axis=-1)
-        reach = length * jnp.sqrt(2 * jnp.log(jnp.maximum(strength * number / self.most_near, 1.0)))
+        # The term `a sum_k ...` of the weight where just `LEAST_NEW` is new.
+        ratio = strength * number / (LEAST_NEW**-0.5 - 1)
+        reach = length * jnp.sqrt(2 * jnp.log(jnp.maximum(ratio, 1.0)))
         return jnp.maximum(reach - nearest, 0.0)
 
 

@@ -13,15 +13,13 @@ from collections.abc import Sequence
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, product, pytree
 
-MIN_PROBABILITY = 1e-6
-"""Minimum class probability that can be read; float32 moments hold no smaller ones."""
-PLAUSIBLE_DISTANCE = 2.0  # standard deviations
-
+_MIN_PROBABILITY = 1e-6  # that can be read; float32 moments hold no smaller ones
+_PLAUSIBLE_DISTANCE = 2.0  # standard deviations
 _STEPS = 25  # of Newton's method
 _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges near certainty
 _DAMPING = 1e-5
@@ -49,7 +47,7 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
 
 def divergence(held: Float[Array, " C"], read: Float[Array, " C"]) -> Float[Array, ""]:
     """Divergence in nats of the class probabilities read from a belief from those held by it."""
-    return jnp.sum(held * (jnp.log(jnp.maximum(held, MIN_PROBABILITY)) - jnp.log(read)))
+    return jnp.sum(held * (jnp.log(jnp.maximum(held, _MIN_PROBABILITY)) - jnp.log(read)))
 
 
 @pytree
@@ -67,7 +65,7 @@ class Readout:
     whitening: Float[Array, "2*D K"]
 
     def class_probabilities(self, belief: Belief, prior: Belief) -> Float[Array, " C"]:
-        """`[C]` probabilities, each at least about `MIN_PROBABILITY`.
+        """`[C]` probabilities, each at least about 1e-6.
 
         Args:
           belief: `[D]`.
@@ -77,7 +75,7 @@ class Readout:
           ValueError: if the belief is not finite, or a standard deviation is not positive.
         """
         checks.require_belief("belief", belief, len(prior.mean))
-        found = jnp.maximum(self._of_maximum_entropy(belief), MIN_PROBABILITY)
+        found = jnp.maximum(self._of_maximum_entropy(belief), _MIN_PROBABILITY)
         apart = jnp.maximum(jnp.abs(belief.mean - prior.mean), jnp.abs(belief.std - prior.std))
         # Tolerates rounding between compiled programs.
         is_prior = jnp.all(apart <= 1e-5 * prior.std)
@@ -100,13 +98,12 @@ class Readout:
         return jax.nn.softmax(product(self.of_classes, theta))
 
 
-def make(classes: Belief, most: int | None = None) -> Readout:
+def make(classes: Belief, numbers: Sequence[int] | None = None) -> Readout:
     """The readout of beliefs in `[C, D]` joint posteriors of classes.
 
     Args:
-      classes: `[C, D]`.
-      most: maximum of K, by default the rank of the moments. Log-posteriors that depend on the
-        labels of sensors alone have `directions`.
+      numbers: of labels of each sensor, if log-posteriors depend on the labels alone: these have
+        one direction fewer for each sensor. By default, K is the rank of the moments.
     """
     chex.assert_rank(classes.mean, 2)
     moments = _moments(classes)
@@ -114,17 +111,13 @@ def make(classes: Belief, most: int | None = None) -> Readout:
     _, singular, axes = jnp.linalg.svd(moments - offset[None], full_matrices=False)
     # Centred moments span one direction fewer than there are classes.
     rank = min(len(moments) - 1, moments.shape[1])
-    rank = rank if most is None else max(1, min(rank, most))
+    if numbers is not None:
+        rank = max(1, min(rank, sum(number - 1 for number in numbers)))
     singular, axes = singular[:rank], axes[:rank]
     is_kept = singular > _THRESHOLD * singular[0]
     length = jnp.where(is_kept, jnp.sqrt(len(moments)) / jnp.where(is_kept, singular, 1.0), 0.0)
     whitening = axes.T * length[None]
     return Readout(product(moments - offset[None], whitening), offset, whitening)
-
-
-def directions(numbers: Sequence[int]) -> int:
-    """Directions of log-posteriors, for the number of labels of each sensor."""
-    return sum(number - 1 for number in numbers)
 
 
 def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
@@ -141,21 +134,11 @@ def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[
     Raises:
       ValueError: if an argument is not finite, or a standard deviation is not positive.
     """
-    _check_belief(belief, class_means)
-    distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
-    return (distance <= PLAUSIBLE_DISTANCE) | (distance <= jnp.min(distance))
-
-
-def nearest_class(belief: Belief, class_means: Float[Array, "C D"]) -> Int[Array, ""]:
-    """The class whose mean is nearest to a belief's, int32; see `plausible_classes`."""
-    _check_belief(belief, class_means)
-    return jnp.argmin(jnp.linalg.norm(class_means - belief.mean[None], axis=-1))
-
-
-def _check_belief(belief: Belief, class_means: jax.Array) -> None:
     checks.require_belief("belief", belief)
     chex.assert_shape(class_means, (None, *belief.mean.shape))
     checks.require_finite("class_means", class_means)
+    distance = jnp.linalg.norm((class_means - belief.mean[None]) / belief.std[None], axis=-1)
+    return (distance <= _PLAUSIBLE_DISTANCE) | (distance <= jnp.min(distance))
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:

@@ -18,8 +18,8 @@ from jaxsense.dqn.rewards import information
 from jaxsense.mission import begin, roadmap
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.sim.light import random_light
-from jaxsense.vae import filter, jmvae
-from jaxsense.vae.readout import nearest_class
+from jaxsense.vae import fusion
+from jaxsense.vae.readout import plausible_classes
 
 # Settings whose models have other shapes.
 OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, latent_size=3))
@@ -42,7 +42,7 @@ class World:
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
         classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
         prior = vae.prior(self.model, 20.0)
-        self.filter = filter.init(self.key, self.model, classes, prior, (1,))
+        self.filter = fusion.init_filter(self.key, self.model, classes, prior, (1,))
         self.in_place = self.models.fusion
         self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
         self.mdp = jaxsense.make_mdp(SMOKE, self.models, jaxsense.Bank(self.bank))
@@ -75,19 +75,6 @@ def of_missions(w, config=SMOKE, models=None, policies=None, **options):
     """A score of missions, of a policy unless others are given."""
     models, policies = models or w.models, policies or {"mine": values}
     return jaxsense.score_missions(config, models, policies, **options)
-
-
-def loss(w, features, weights=(1.0, 1.0)):
-    """A loss of some features."""
-    return jmvae.loss(
-        w.key,
-        w.params,
-        w.model,
-        features,
-        alpha=0.1,
-        beta=1.0,
-        reconstruction_weights=weights,
-    )
 
 
 def retrain(w, windows=None, labels=None):
@@ -216,13 +203,13 @@ FUNCTIONS = {
         "readings of dtype uint8: must be real numbers",
     ),
     "Sensor stride": (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
-    "Jmvae twice": (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "must name none twice"),
+    "Jmvae twice": (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "none twice"),
     "Jmvae plus": (
         lambda w: vae.Jmvae(("a", "b", "a+b"), (2, 2, 2), 2, (8,)),
-        "modalities = ('a', 'b', 'a+b'): must have no +, which joins names",
+        "modalities = ('a', 'b', 'a+b'): must be one name or more, none twice, and none with a +",
     ),
-    "loss batch": (
-        lambda w: loss(w, (w.x[None], w.x[None])),
+    "posterior batch": (
+        lambda w: vae.posterior(w.params, w.model, (w.x[None], w.x[None])),
         "features of camera has the shape (1, 2): must be (2,); use jax.vmap for a batch",
     ),
     "class_probabilities batch": (
@@ -249,17 +236,17 @@ FUNCTIONS = {
         lambda w: w.in_place.update(w.belief, w.seen, w.x, 2),
         "modality = 2: must be 0 (camera) or 1 (lidar)",
     ),
-    "bayes_update none": (
-        lambda w: vae.bayes_update(jnp.full(2, -INF), w.look, jnp.array([0, 1])),
-        "largest of log_weights = -inf: must be finite",
+    "bayes none": (
+        lambda w: w.models.bayes.update(jnp.full(3, -INF), w.look, 0),
+        "largest of log_posterior = -inf: must be finite",
     ),
     "interpolate": (
         lambda w: interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)),
         "length of table = 7: must be 6 or another size of a grid",
     ),
     "prior": (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
-    "nearest_class": (
-        lambda w: nearest_class(w.belief_of(mean=w.x * NAN), w.means),
+    "plausible_classes": (
+        lambda w: plausible_classes(w.belief_of(mean=w.x * NAN), w.means),
         "belief.mean = nan: must be finite",
     ),
     "information zero": (lambda w: information(w.x), "std = 0.0: must be greater than 0"),

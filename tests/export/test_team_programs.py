@@ -81,7 +81,7 @@ def models():
     found = jaxsense.init(jax.random.key(0), OWN)
     classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
     fusion = found.fusion
-    read = readout.make(classes, readout.directions(fusion.model.feature_sizes))
+    read = readout.make(classes, fusion.model.feature_sizes)
     network = MLP(fusion.hidden, read.of_classes.shape[1])
     sizes = zip(fusion.model.modalities, fusion.model.feature_sizes, strict=True)
     params = {

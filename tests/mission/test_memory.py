@@ -21,7 +21,7 @@ from jaxsense.mission.maps import MOST_LOOKS, Contents, Evidence, OwnMap, Shared
 from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
-from jaxsense.vae.filter import Filter
+from jaxsense.vae.fusion import Filter
 
 MODALITY = jnp.array([0, 1, 1])
 NOTHING = Evidence(jnp.zeros(3), jnp.zeros(3))
@@ -40,7 +40,7 @@ def own_models():
     classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
     fusion = models.fusion
     assert isinstance(fusion, Filter)
-    read = readout.make(classes, readout.directions(fusion.model.feature_sizes))
+    read = readout.make(classes, fusion.model.feature_sizes)
     network = MLP(fusion.hidden, read.of_classes.shape[1])
     params = {
         name: networks.scale_last(network, networks.init(jax.random.key(i), network, size), 0.3)
@@ -147,7 +147,7 @@ def test_a_full_memory_takes_nothing_more():
 
 
 def test_looks_one_by_one_come_to_the_shared_map(own_models):
-    """To rounding: `MIN_PROBABILITY` is far below these."""
+    """To rounding: the least probability is far below these."""
     fusion, held = own_models.fusion, maps.empty(MODALITY, 3)
     tiled = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), fusion.prior)
     prior = jnp.tile(own_models.bayes.prior, (2, 1))

@@ -9,8 +9,8 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config import Config
-from jaxsense.sim import absence, windows, world
 from jaxsense.sim import arena as arenas
+from jaxsense.sim import viewpoints, windows, world
 from jaxsense.sim.viewpoints import bearing
 
 CONFIG = Config()
@@ -28,16 +28,18 @@ def looks():
         scene = world.random_scene(scene_key, simulation, jnp.array([0, 1, 2]))
         _, scene = world.look(look_key, simulation, scene, robot, jnp.int32(0))
         pose, place = scene.poses[robot], scene.layout.position[0]
-        before = absence.View(
+        before = viewpoints.View(
             positions=scene.layout.position,
             poses=scene.poses,
-            twin=jnp.array(absence.outside(CONFIG.arena)),
+            twin=jnp.array(viewpoints.outside(CONFIG.arena)),
             bearing=bearing(pose, place),
             distance=jnp.linalg.norm(place - pose[:2]),
         )
         arena, sensors = CONFIG.arena, simulation.sensors
         poi = jnp.int32(0)
-        view = absence.without_poi(change_key, sensors, arena, CONFIG.viewpoint, before, robot, poi)
+        view = viewpoints.without_poi(
+            change_key, sensors, arena, CONFIG.viewpoint, before, robot, poi
+        )
         layout = dataclasses.replace(scene.layout, position=view.positions)
         data = arenas.place(simulation.arena, layout, view.poses)
         sensor = sensors[robot]
@@ -57,7 +59,7 @@ def looks():
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks, robot):
     _, view, is_poi, angles = looks[robot]
-    away = absence.outside(CONFIG.arena)
+    away = viewpoints.outside(CONFIG.arena)
     has_twin = np.any(view.twin != away, axis=-1)
     is_middle = np.abs(angles - view.bearing[:, None]) < np.radians(1.0)
     shows = (is_poi & is_middle).any(axis=1)
@@ -69,7 +71,7 @@ def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks, robot)
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
 def test_every_situation_is_drawn(looks, robot):
     before, view, _, _ = looks[robot]
-    away = absence.outside(CONFIG.arena)
+    away = viewpoints.outside(CONFIG.arena)
     inside = np.abs(view.poses[:, robot, :2]).max(axis=-1) < CONFIG.arena.side / 2
     moved = np.any(view.poses[:, robot] != before.poses[:, robot], axis=-1)
     gone = np.all(view.positions[:, 0] == away, axis=-1)

@@ -28,8 +28,9 @@ def given_to_detectors(windows, labels):
 
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.25, 7)])
 def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, monkeypatch):
-    config = dataclasses.replace(TINY.detector, calibration=share)
-    config = dataclasses.replace(TINY, detector=config)
+    config = dataclasses.replace(TINY.detector, calibration=share, num_scans=10)
+    arena = dataclasses.replace(TINY.arena, num_pois=1)
+    config = dataclasses.replace(TINY, detector=config, arena=arena)
     # Of .25 of ten looks, three calibrate.
     windows, labels = jnp.arange(20.0).reshape(10, 2), jnp.arange(10) % 2
     given, used = given_to_detectors(windows, labels), {}

@@ -149,3 +149,15 @@ def test_moment_matching_error_as_worked_by_hand():
 
 def _belief(mean, std):
     return Belief(jnp.array(mean), jnp.array(std))
+
+
+def test_calibration_error_and_likelihood_by_hand():
+    # In the bin above 14/15: .95 and 1.0, of which one is right; in that above .6: .65, right.
+    probabilities = jnp.array([[0.95, 0.05], [0.0, 1.0], [0.65, 0.35]])
+    labels = jnp.array([0, 0, 0])
+    expected = (abs(0.95 + 1.0 - 1) + abs(0.65 - 1)) / 3
+    assert measures.calibration_error(probabilities, labels) == pytest.approx(expected, abs=1e-6)
+    found = measures.negative_log_likelihood(probabilities[::2], labels[::2])
+    assert found == pytest.approx(-(np.log(0.95) + np.log(0.65)) / 2, rel=1e-5)
+    # A label of probability zero costs no more than a finite number.
+    assert np.isfinite(measures.negative_log_likelihood(probabilities, labels))

@@ -13,9 +13,9 @@ from jaxsense import PRESETS, Config, looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
-from jaxsense.models import make_shape
+from jaxsense.models import make_scan_jmvae
 from jaxsense.training import scans
-from jaxsense.training.scans import Shown
+from jaxsense.training.detections import Shown, repeated
 from jaxsense.training.stage import Stage
 from jaxsense.training.surveys import draw_scenes, num_scenes
 from jaxsense.vae import leave_one_out
@@ -117,11 +117,11 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
 
 
 def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
-    outputs, shape = learned.outputs, make_shape(TINY)
+    outputs, model = learned.outputs, make_scan_jmvae(TINY)
     num_bank = num_scenes(TINY)[1]
     classes = np.asarray(outputs["class_beliefs"].mean)
 
-    posterior = jax.jit(lambda given: leave_one_out.posterior(outputs["best_jmvae"], shape, given))
+    posterior = jax.jit(lambda given: leave_one_out.posterior(outputs["best_jmvae"], model, given))
     in_frames = jax.jit(
         lambda given: tuple(
             jax.vmap(scaling)(x)
@@ -157,11 +157,17 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
         given.extend(given_here)
         return encoder
 
+    def fit(key, state, problem, number):
+        used.append(problem)
+        return state, ()
+
+    used = []
     monkeypatch.setattr(leave_one_out, "calibrate", calibrate)
-    monkeypatch.setattr(supervised, "fit", lambda key, state, problem, number: (problem, ()))
+    monkeypatch.setattr(supervised, "fit", fit)
     inputs = inputs_of(stage.name, TINY, outputs)
     state = stage.begin(KEY, TINY, **inputs)
-    (encoder, problem), _ = stage.advance(KEY, TINY, state, **inputs)
+    state, _ = stage.advance(KEY, TINY, state, **inputs)
+    encoder, problem = stage.finish(TINY, state, **inputs), used[0]
     np.testing.assert_array_equal(given[0], windows[28:].reshape(-1, size))
     np.testing.assert_array_equal(given[1], outputs["shown"].calibrating.reshape(-1))
     np.testing.assert_array_equal(problem.shown.windows, windows[:28].reshape(-1, size))
@@ -177,12 +183,13 @@ def test_repeated_looks_are_at_pois_of_the_bank_and_show_what_all_looks_show(lea
     _, classes, _, places = scenes
     num_bank = num_scenes(TINY)[1]
     bank = (classes[num_train : num_train + num_bank] + 1) % 3  # nowhere the true class
-    found = scans.repeated(KEY, REPEATING, scenes=scenes, shown=Shown(bank[:0], bank))
-    assert found.classes.shape == (30, 3)
-    np.testing.assert_array_equal(found.taken_for, (found.classes[:, 0] + 1) % 3)
+    seen, of_places, taken_for = repeated(KEY, REPEATING, scenes, Shown(bank[:0], bank))
+    assert seen.shape == (30, 3)
+    assert of_places is not None
+    np.testing.assert_array_equal(taken_for, (seen[:, 0] + 1) % 3)
     groups = num_bank // 4
     assert groups < 30
     # The i-th scene shows the PoIs of the i-th group of four scenes, then the first again.
     of_scenes = jax.random.key_data(places)[num_train : num_train + num_bank]
     expected = np.asarray(of_scenes)[np.arange(30) % groups * 4]
-    np.testing.assert_array_equal(jax.random.key_data(found.places), expected)
+    np.testing.assert_array_equal(jax.random.key_data(of_places), expected)

@@ -190,18 +190,6 @@ def test_calibration_finds_the_temperature_of_the_labels(temperature, left, erro
     np.testing.assert_allclose(found[-1], 1.0, rtol=1e-5)
 
 
-def test_calibration_error_and_likelihood_by_hand():
-    # In the bin above 14/15: .95 and 1.0, of which one is right; in that above .6: .65, right.
-    probabilities = jnp.array([[0.95, 0.05], [0.0, 1.0], [0.65, 0.35]])
-    labels = jnp.array([0, 0, 0])
-    expected = (abs(0.95 + 1.0 - 1) + abs(0.65 - 1)) / 3
-    assert detectors.calibration_error(probabilities, labels) == pytest.approx(expected, abs=1e-6)
-    found = detectors.negative_log_likelihood(probabilities[::2], labels[::2])
-    assert found == pytest.approx(-(np.log(0.95) + np.log(0.65)) / 2, rel=1e-5)
-    # A label of probability zero costs no more than a finite number.
-    assert np.isfinite(detectors.negative_log_likelihood(probabilities, labels))
-
-
 # The first reading is the log-odds of a window, less the distance beyond 1 m; the second is the
 # logit of a label.
 READ = [[0, 0, 1], [1, 0, 0], [0, 0, -1], [0, 0, 0]]

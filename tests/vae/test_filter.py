@@ -12,7 +12,8 @@ import pytest
 from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
-from jaxsense.vae import bayes, filter, fusion
+from jaxsense.vae import fusion
+from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.jmvae import Jmvae
 
 # Red or green, cylinder or cube: classes are green cylinder, red cylinder, red cube.
@@ -24,7 +25,7 @@ NOBODY = np.zeros(2, bool)
 
 
 def untrained(hidden=(1,)):
-    return filter.init(jax.random.key(0), MODEL, CLASSES, PRIOR, hidden)
+    return fusion.init_filter(jax.random.key(0), MODEL, CLASSES, PRIOR, hidden)
 
 
 def exact():
@@ -102,7 +103,7 @@ TRAINED = FilterConfig(steps=600)
 def trained():
     """A filter after two chunks of half its training, and all losses."""
     found = untrained((16,))
-    problem = filter.Fitting(TRAINED, found, bank(jax.random.key(2), 4000))
+    problem = fusion.Filtering(TRAINED, found, bank(jax.random.key(2), 4000))
     train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
     state, losses = supervised.start(found.networks, TRAINED), []
     for i in range(2):
@@ -115,16 +116,16 @@ def test_a_trained_filter_is_nearly_exact_bayes(trained):
     learned, losses = trained
     assert losses[-50:].mean() < 0.7 * losses[:10].mean()
     looks = bank(jax.random.key(9), 2000)
-    labels = jnp.array(LABELS)
+    exact = Bayes(jnp.array(LABELS))
 
     def history(true_class, row):
-        belief, log_weights = PRIOR, jnp.full(3, -jnp.log(3.0))
+        belief, log_posterior = PRIOR, exact.prior
         for modality in (1, 0, 1, 1):
             features = looks[modality][true_class, row]
             belief = learned.update(belief, NOBODY, features, modality)
-            log_weights = bayes.bayes_update(log_weights, features, labels[modality])
+            log_posterior = exact.update(log_posterior, features, modality)
             row = row + 500
-        return jnp.log(learned.class_probabilities(belief)), log_weights
+        return jnp.log(learned.class_probabilities(belief)), log_posterior
 
     every = jnp.arange(3), jnp.arange(500)
     found, expected = jax.jit(jax.vmap(jax.vmap(history, (None, 0)), (0, None)))(*every)

@@ -58,7 +58,7 @@ def test_chromaticity_keeps_colour_and_drops_the_light():
 
 def test_scaling_standardises_by_the_training():
     windows = 3.0 + 2.0 * jax.random.normal(jax.random.key(0), (500, 4))
-    scaling, seen = frames.scaled(frames.Plain(), windows)
+    scaling, seen = frames.scaled(frames.Frame(), windows)
     np.testing.assert_allclose(seen.mean(axis=0), 0, atol=1e-5)
     np.testing.assert_allclose(seen.std(), 1, rtol=1e-3)
     np.testing.assert_allclose(jax.vmap(scaling)(windows), seen, rtol=1e-4, atol=1e-5)

@@ -27,7 +27,7 @@ def in_place(model, params, classes=None):
     shape = 3, model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape)) if classes is None else classes
     prior = fusion.prior(model, 20.0)
-    return fusion.InPlace(params, classes, prior, readout.make(classes), model)
+    return fusion.InPlace(classes, prior, readout.make(classes), model, params)
 
 
 def look(model, modality, seed=0):
@@ -70,7 +70,7 @@ def test_several_sensors_may_look_at_once():
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
     params, looks = init(jax.random.key(0), TWO), (look(TWO, 0), look(TWO, 1))
     config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))
-    problem = fusion.Decoding(config, params, tuple(x[None, None] for x in looks), TWO)
+    problem = fusion.Decoding(config, tuple(x[None, None] for x in looks), TWO, params)
     drawn = jnp.zeros((2, 1)), tuple(x[:, None] for x in looks)
     found = problem.loss(params["decoders"], drawn, jnp.int32(0))
     expected = 0.0

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsense.core.types import Belief
 from jaxsense.vae import gaussian
 
 LOG4 = np.log(4.0)
@@ -41,11 +42,10 @@ def test_kl_is_the_mean_log_ratio_of_the_densities():
 def test_moment_match_as_worked_by_hand():
     # Dimension 1: mean (0 + 4) / 2 = 2, variance (1 + 9) / 2 + (4 + 4) / 2 = 9.
     # Dimension 2: two equal components are matched by themselves.
-    mean, std = gaussian.moment_match(
-        jnp.array([[0.0, 1.0], [4.0, 1.0]]), jnp.array([[1.0, 0.5], [3.0, 0.5]])
-    )
-    np.testing.assert_allclose(mean, [2.0, 1.0], rtol=1e-6)
-    np.testing.assert_allclose(std, [3.0, 0.5], rtol=1e-6)
+    parts = Belief(jnp.array([[0.0, 1.0], [4.0, 1.0]]), jnp.array([[1.0, 0.5], [3.0, 0.5]]))
+    found = gaussian.moment_match(parts)
+    np.testing.assert_allclose(found.mean, [2.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(found.std, [3.0, 0.5], rtol=1e-6)
 
 
 def test_a_product_with_what_knows_nothing_stays_as_it_is():
@@ -65,3 +65,15 @@ def test_sample_as_worked_by_hand():
     two = jnp.stack([mean, mean], axis=-1), jnp.stack([log_var, log_var], axis=-1)
     z = gaussian.sample(jnp.array([[1.5, 0.0], [-2.0, 4.0]]), *two)
     np.testing.assert_allclose(z, [[5.0, 2.0], [-2.0, 1.0]], rtol=1e-6)
+
+
+def test_product_of_experts_by_hand():
+    of = lambda mean, std: Belief(jnp.array([mean]), jnp.array([std]))  # noqa: E731
+    prior = of(0.0, 1.0)
+    # Precisions 4 + 4 - 1 = 7, and (4 * 1 + 4 * 3 - 0) / 7.
+    found = gaussian.product_of_experts(of(1.0, 0.5), of(3.0, 0.5), prior)
+    np.testing.assert_allclose(found.mean, [16 / 7], rtol=1e-6)
+    np.testing.assert_allclose(found.std, [7**-0.5], rtol=1e-6)
+    # A look that knows nothing changes nothing.
+    found = gaussian.product_of_experts(of(1.0, 0.5), prior, prior)
+    np.testing.assert_allclose([found.mean[0], found.std[0]], [1.0, 0.5], rtol=1e-6)

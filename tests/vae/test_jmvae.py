@@ -1,10 +1,13 @@
-"""The JMVAE's encoders, decoders, loss and training."""
+"""The JMVAE's encoders, decoders, loss, training and likelihood."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.stats import multivariate_normal
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.vae import jmvae
@@ -16,7 +19,7 @@ THREE = Jmvae(("camera", "lidar", "sonar"), (2, 3, 1), latent_size=4, hidden=(8,
 
 init = jax.jit(jmvae.init, static_argnums=1)
 encode = jax.jit(jmvae.encode, static_argnums=1)
-loss = jax.jit(jmvae.loss, static_argnums=2)
+losses = jax.jit(jmvae.losses, static_argnums=2)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -54,10 +57,11 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     np.testing.assert_allclose(mean, [14 / 5], rtol=1e-6)
     np.testing.assert_allclose(log_var, [-np.log(5)], rtol=1e-6)
     options = {"alpha": 1.0, "beta": 1.0, "reconstruction_weights": (1.0,) * 3}
-    _, parts = loss(jax.random.key(0), params, model, some_features(model), **options)
+    columns = tuple(x[:, None] for x in some_features(model))
+    _, parts = losses(jnp.zeros((1, 1)), params, model, columns, **options)
     # KL(N(0, 1) || N(m, v)) = (1/v + m^2/v - 1 + ln v) / 2 for camera and LiDAR, 0 for the sonar.
     expected = (2 + 2 - 1 - np.log(2)) / 2 + (4 + 36 - 1 - np.log(4)) / 2
-    np.testing.assert_allclose(parts["subsets"], expected, rtol=1e-5)
+    np.testing.assert_allclose(parts["subsets"], [expected], rtol=1e-5)
 
 
 def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
@@ -76,3 +80,133 @@ def test_beta_falls_by_equal_factors_to_its_last_value():
     betas = [float(jmvae.annealed_beta(jnp.int32(s), config)) for s in (0, 25, 50, 99)]
     # Half way through the 50 steps of annealing, sqrt(1 x .01) = .1.
     np.testing.assert_allclose(betas, [1.0, 0.1, 0.01, 0.01], rtol=1e-5)
+
+
+# What it is trained on: which detections are drawn from a bank.
+
+SETTINGS = JmvaeConfig(batch=64, steps=40)
+# Class c and row r as 10 c + r; the two modalities have different numbers of rows.
+CLASSES, ROWS = np.float32(10) * np.arange(4)[:, None, None], np.arange(5)[None, :, None]
+CAMERA = CLASSES + ROWS[:, :3]
+LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    return jmvae.Fitting(
+        SETTINGS, (CAMERA, LIDAR), Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
+    ).draw(jax.random.key(0), 20)
+
+
+def test_every_class_and_every_row_of_a_bank_is_drawn(drawn):
+    noise, (camera, lidar) = drawn
+    assert noise.shape == (20, 2, 64)
+    assert (camera.shape, lidar.shape) == ((20, 1, 64), (20, 2, 64))
+    # 1,280 draws: each of 20 is missed with a chance of (19/20)^1280, below 1e-28.
+    assert set(np.unique(camera)) == set(np.asarray(CAMERA).ravel().tolist())
+    assert set(np.unique(lidar)) == set(np.asarray(LIDAR).ravel().tolist())
+
+
+def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
+    _, (camera, lidar) = drawn
+    camera, first, second = np.asarray(camera[:, 0]), *np.moveaxis(np.asarray(lidar), 1, 0)
+    np.testing.assert_array_equal(camera // 10, first // 10)
+    np.testing.assert_array_equal(first, second)
+    pairs = set(zip((camera % 10).ravel().tolist(), (first % 10).ravel().tolist(), strict=True))
+    assert len(pairs) == 3 * 5
+    assert not np.array_equal(camera[0], camera[1])
+
+
+# The loss, term by term, against the equation written down anew.
+
+MODEL = Jmvae(("camera", "lidar"), (2, 3), latent_size=2, hidden=(8, 5))
+OPTIONS = {"alpha": 0.3, "beta": 0.7, "reconstruction_weights": (2.0, 5.0)}
+BATCH = 6
+
+
+@pytest.fixture(scope="module")
+def example():
+    """Parameters, all of them random, noise, features and what `losses` makes of them."""
+    keys = jax.random.split(jax.random.key(0), 4)
+    params = jmvae.init(keys[0], MODEL)
+    flat, unravel = ravel_pytree(params)
+    # Biases of zero would hide where they are added.
+    params = unravel(flat + 0.3 * jax.random.normal(keys[1], flat.shape))
+    noise = jax.random.normal(keys[2], (MODEL.latent_size, BATCH))
+    features = tuple(
+        jax.random.uniform(k, (size, BATCH))
+        for k, size in zip(jax.random.split(keys[3]), MODEL.feature_sizes, strict=True)
+    )
+    return params, noise, features, losses(noise, params, MODEL, features, **OPTIONS)
+
+
+def dense(params, x):
+    """Layers with ReLU between them, in double precision."""
+    layers = [params["params"][f"Dense_{i}"] for i in range(3)]
+    for i, layer in enumerate(layers):
+        x = np.asarray(layer["kernel"], np.float64).T @ x + np.asarray(layer["bias"])
+        x = np.maximum(x, 0) if i < 2 else x
+    return x
+
+
+def kl(mean, variance, mean_q, variance_q):
+    """`KL(N(mean, variance) || N(mean_q, variance_q))`, summed over dimensions."""
+    of_each = np.log(np.sqrt(variance_q / variance)) - 0.5
+    of_each = of_each + (variance + (mean - mean_q) ** 2) / (2 * variance_q)
+    return of_each.sum()
+
+
+def test_every_term_is_that_of_the_equation(example):
+    params, noise, features, (total, parts) = example
+    for i in range(BATCH):
+        x, w = (np.asarray(f[:, i], np.float64) for f in features)
+        joint, camera, lidar = (
+            np.split(dense(params["encoders"][name], v), 2)
+            for name, v in (
+                ("camera+lidar", np.concatenate([x, w])), ("camera", x), ("lidar", w)
+            )
+        )  # fmt: skip
+        mean, variance = joint[0], np.exp(joint[1])
+        z = mean + np.sqrt(variance) * np.asarray(noise[:, i])
+        # -log N(x; decoded, 1) without the constant.
+        of_camera = 0.5 * np.sum((x - dense(params["decoders"]["camera"], z)) ** 2)
+        of_lidar = 0.5 * np.sum((w - dense(params["decoders"]["lidar"], z)) ** 2)
+        prior = kl(mean, variance, np.zeros(2), np.ones(2))
+        subsets = kl(mean, variance, camera[0], np.exp(camera[1]))
+        subsets += kl(mean, variance, lidar[0], np.exp(lidar[1]))
+        reconstruction = 2.0 * of_camera + 5.0 * of_lidar
+        np.testing.assert_allclose(parts["reconstruction"][i], reconstruction, rtol=1e-4)
+        np.testing.assert_allclose(parts["prior"][i], prior, rtol=1e-4)
+        np.testing.assert_allclose(parts["subsets"][i], subsets, rtol=1e-4)
+        expected = reconstruction + 0.7 * prior + 0.3 * subsets
+        np.testing.assert_allclose(total[i], expected, rtol=1e-4)
+
+
+# The likelihood of features, with decoders for which it is known.
+
+LINEAR = Jmvae(("camera", "lidar"), (2, 3), latent_size=2, hidden=())
+WEIGHTS = (4.0, 0.5)
+FEATURES = (np.float32([0.3, -0.2]), np.float32([0.5, 0.1, -0.4]))
+estimate = jax.jit(jmvae.log_likelihood, static_argnames=("model", "samples"))
+
+
+@pytest.fixture(scope="module")
+def params():
+    return jmvae.init(jax.random.key(0), LINEAR)
+
+
+def exact(params, present):
+    """Features of linear decoders are normal: their moments follow from those of the latents."""
+    offset = jmvae.decode(params, LINEAR, jnp.zeros(2))
+    jacobian = jax.jacobian(lambda z: jmvae.decode(params, LINEAR, z))(jnp.zeros(2))
+    w = np.concatenate([jacobian[m] for m in present])
+    noise = np.concatenate([np.full(len(FEATURES[m]), 1 / WEIGHTS[m]) for m in present])
+    x, mean = (np.concatenate([of[m] for m in present]) for of in (FEATURES, offset))
+    return multivariate_normal.logpdf(x, mean, w @ w.T + np.diag(noise))
+
+
+@pytest.mark.parametrize("present", [(0,), (1,), (0, 1)])
+def test_linear_decoders_have_a_likelihood_in_closed_form(params, present):
+    features = tuple(x if m in present else None for m, x in enumerate(FEATURES))
+    found = estimate(jax.random.key(1), params, LINEAR, features, WEIGHTS, samples=20_000)
+    np.testing.assert_allclose(found, exact(params, present), atol=0.03)

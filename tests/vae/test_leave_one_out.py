@@ -8,15 +8,16 @@ import pytest
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core.types import Belief
 from jaxsense.vae import detectors, frames, leave_one_out, readout
-from jaxsense.vae.leave_one_out import Encoder, Shape
+from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.leave_one_out import Encoder
 
-SHAPE = Shape(("camera", "lidar"), (3, 5), latent_size=2, hidden=(4,))
+MODEL = Jmvae(("camera", "lidar"), (3, 5), latent_size=2, hidden=(4,))
 NUMBER, POIS = 3, 2
 KEY = jax.random.key(0)
-PARAMS = jax.jit(lambda: leave_one_out.init(KEY, SHAPE))()
+PARAMS = jax.jit(lambda: leave_one_out.init(KEY, MODEL))()
 RNG = np.random.default_rng(0)
 LOOKS = tuple(
-    jnp.asarray(RNG.normal(size=(POIS, NUMBER, size)), jnp.float32) for size in SHAPE.inputs
+    jnp.asarray(RNG.normal(size=(POIS, NUMBER, size)), jnp.float32) for size in MODEL.feature_sizes
 )
 NOISE = RNG.normal(size=(2, 2, POIS, NUMBER)).astype(np.float32)
 WEIGHTS = 6.0, 15.0
@@ -41,7 +42,7 @@ def dense(params, x, has_relu=True):
 def joint(looks):
     """Mean and log-variance from a list of looks by each sensor."""
     means = []
-    for name, given in zip(SHAPE.modalities, looks, strict=True):
+    for name, given in zip(MODEL.modalities, looks, strict=True):
         found = [np.maximum(dense(PARAMS["embeddings"][name], x), 0) for x in given]
         means.append(np.mean(found, axis=0))
     return np.split(dense(PARAMS["joint"], np.concatenate(means)), 2)
@@ -61,7 +62,7 @@ def plain_losses(alpha, beta):
     for b in range(POIS):
         every = joint([x[0][b], x[1][b]])
         losses[b] += beta * divergence(every, normal)
-        for m, name in enumerate(SHAPE.modalities):
+        for m, name in enumerate(MODEL.modalities):
             for k in range(NUMBER):
                 others = [list(x[0][b]), list(x[1][b])]
                 del others[m][k]
@@ -75,7 +76,7 @@ def plain_losses(alpha, beta):
         for k in range(NUMBER):
             pair = joint([[x[0][b, k]], [x[1][b, k]]])
             losses[b] += alpha * divergence(every, pair)
-    for m, size in enumerate(SHAPE.inputs):
+    for m, size in enumerate(MODEL.feature_sizes):
         variance = np.mean(errors[m]) / size
         of_looks = errors[m] / (size * variance) + np.log(variance)
         losses += 0.5 * WEIGHTS[m] * of_looks.sum(axis=1)
@@ -86,7 +87,7 @@ def plain_losses(alpha, beta):
 def losses_of(params, alpha=0.7, beta=0.3, has_begun=1.0):
     weights = {"alpha": alpha, "beta": beta, "has_begun": has_begun}
     return leave_one_out.losses(
-        NOISE, params, SHAPE, LOOKS, **weights, reconstruction_weights=WEIGHTS
+        NOISE, params, MODEL, LOOKS, **weights, reconstruction_weights=WEIGHTS
     )
 
 
@@ -117,12 +118,12 @@ def test_before_alpha_sets_in_single_encoders_follow_and_do_not_draw():
 
 def test_the_posterior_takes_any_number_of_looks_in_any_order():
     looks = tuple(np.asarray(x[0]) for x in LOOKS)
-    found = posterior(PARAMS, SHAPE, looks)
+    found = posterior(PARAMS, MODEL, looks)
     mean, log_var = joint(looks)
     np.testing.assert_allclose(found.mean, mean, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.std, np.exp(0.5 * log_var), rtol=1e-5)
-    turned = posterior(PARAMS, SHAPE, (looks[0][::-1], looks[1][[1, 0]]))
-    fewer = posterior(PARAMS, SHAPE, (looks[0], looks[1][:2]))
+    turned = posterior(PARAMS, MODEL, (looks[0][::-1], looks[1][[1, 0]]))
+    fewer = posterior(PARAMS, MODEL, (looks[0], looks[1][:2]))
     np.testing.assert_allclose(turned.mean, fewer.mean, rtol=1e-5, atol=1e-6)
 
 
@@ -130,7 +131,7 @@ def test_alpha_sets_in_late():
     config = JmvaeConfig(
         learns_from="scans", fusion="filter", hidden=(4,), steps=100, alpha=3.0, annealing=0.0,
     )  # fmt: skip
-    problem = leave_one_out.Fitting(config, LOOKS, SHAPE)
+    problem = leave_one_out.Fitting(config, LOOKS, MODEL)
     rows, noise = problem.draw(KEY, 1)
     drawn, loss = (rows[0], noise[0]), jax.jit(problem.loss)
     early, start, late, end = (
@@ -146,17 +147,17 @@ CLASSES = Belief(jnp.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]), jnp.full((3
 
 
 def encoder_of(sharpness=1.0) -> Encoder:
-    shape = Shape(("camera",), (1,), latent_size=2, hidden=())
+    model = Jmvae(("camera",), (1,), latent_size=2, hidden=())
     kernel = jnp.array([[1.0, 0.0, 0.0, 0.0]])
     # q(z | x): first latent known, second that of either class.
     bias = jnp.array([0.0, 0.0, 2 * np.log(0.3), 2 * np.log(np.sqrt(1 + 0.09))])
     params = {"params": {"Dense_0": {"kernel": kernel, "bias": bias}}}
     prior = Belief(jnp.zeros(2), jnp.full(2, np.sqrt(20.0)))
     presence = detectors.init(KEY, jnp.ones((2, 1)), 1, DetectorConfig(hidden=(2,)))
-    scaling = frames.Scaling(frames.Plain(), jnp.zeros(1), jnp.float32(1.0))
+    scaling = frames.Scaling(frames.Frame(), jnp.zeros(1), jnp.float32(1.0))
     return Encoder(
-        params, scaling, presence, CLASSES, readout.make(CLASSES, 2), prior,
-        jnp.float32(sharpness), shape, label_of_class=(0, 0, 1),
+        params, scaling, presence, readout.make(CLASSES, [2, 2]), prior,
+        jnp.float32(sharpness), model, label_of_class=(0, 0, 1),
     )  # fmt: skip
 
 

@@ -139,11 +139,3 @@ def test_plausible_classes_lie_within_two_standard_deviations(mean, std, expecte
         tuple(readout.plausible_classes(Belief(jnp.array(mean), jnp.array(std)), CLASS_MEANS))
         == expected
     )
-
-
-def test_nearest_class_goes_by_the_mean_alone():
-    # To (2, 1.9): sqrt(4 + 3.61) = 2.76, sqrt(1 + 3.61) = 2.15, sqrt(4 + 4.41) = 2.9.
-    assert (
-        readout.nearest_class(Belief(jnp.array([2.0, 1.9]), jnp.array([9.0, 0.1])), CLASS_MEANS)
-        == 1
-    )
