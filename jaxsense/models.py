@@ -23,13 +23,12 @@ from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.windows import Domain, make_domain
 from jaxsense.vae import detectors, frames, fusion, jmvae, leave_one_out, novelty, readout
-from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.detectors import Classifier, Detection, Detector
 from jaxsense.vae.frames import Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.leave_one_out import Encoder
 from jaxsense.vae.novelty import Novelty
-from jaxsense.vae.readout import Readout
+from jaxsense.vae.readout import Bayes, Readout
 
 _NO_SEARCH = Search()
 _UNSEEN_VARIANCE = 20.0  # of each latent dimension of the belief before any look

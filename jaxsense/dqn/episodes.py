@@ -27,7 +27,7 @@ _FINE = 16  # steps of a lattice between whose points values are right to a hund
 
 
 class LogLikelihoods(Protocol):
-    """How the exact Bayes filter reads a look; see `vae.bayes.Bayes`."""
+    """How the exact Bayes filter reads a look; see `vae.readout.Bayes`."""
 
     def log_likelihoods(self, features: Float[Array, " L"], modality: int) -> Float[Array, " C"]:
         """Log-likelihood of each class given one look."""

@@ -53,9 +53,6 @@ class Compared:
 def compare(config: Config, looks: RecordedLooks) -> dict[str, Compared]:
     """Compares recorded looks with simulated ones at the same bearing and distance.
 
-    Args:
-      looks: see `recorded.read`.
-
     Returns:
       What was found of each recorded sensor; print it.
 
@@ -109,7 +106,6 @@ def simulate(
 
     Args:
       key: random key of light, yaw, error of the bearing and noise.
-      modality: index of the sensor; static.
       bearing: believed bearing of the PoI, in radians.
       distance: distance of its centre, in metres; less than to the walls.
     """

@@ -304,8 +304,6 @@ def readout_error(
     is as good as a belief can be.
 
     Args:
-      key: of the histories.
-      config: all settings.
       bank: looks at every class.
       classes: `[C, D]` mean joint posterior of each class.
       read: class probabilities of a belief.

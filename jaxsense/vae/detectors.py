@@ -129,7 +129,6 @@ def search(
     as well, and their mean is less noisy than a single one.
 
     Args:
-      detector: of the sensor.
       windows: those with a reading that is not finite count for nothing.
       distances: expected distances of the PoI's centre, in metres.
       log_prior: up to a constant; minus infinity for what is not to be considered.
@@ -226,7 +225,6 @@ class Fitting:
 
     Attributes:
       config: batch, of looks at PoIs, learning rate and steps.
-      detector: from `init`.
       shown: looks at PoIs.
       labels: `[S]` int32 their labels.
       nothing: looks that show no PoI.
@@ -308,8 +306,6 @@ def retrain(
     with looks kept from training.
 
     Args:
-      key: random key.
-      detector: a trained detector.
       shown: looks at PoIs, see `sim.cut_out`, in random order.
       labels: `[S]` int32 their labels.
       config: batch, learning rate, steps, and the share of looks to keep, `calibration`; static.

@@ -46,7 +46,6 @@ class Reader:
       classes: `[C, D]` mean joint posterior of each class.
       prior: `[D]` belief before any look.
       readout: reads class probabilities from beliefs.
-      model: shape of the JMVAE.
     """
 
     classes: Belief
@@ -65,11 +64,7 @@ class Reader:
 
 @pytree
 class InPlace(Reader):
-    """The paper's fusion: a look replaces the belief; the map keeps no features of earlier looks.
-
-    Attributes:
-      params: of the JMVAE.
-    """
+    """The paper's fusion: a look replaces the belief, and the map keeps no earlier features."""
 
     params: Params
     accumulates = False
@@ -114,8 +109,6 @@ def fuse(
     The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
 
     Args:
-      params: of the JMVAE.
-      model: shape of the JMVAE.
       belief: `[D]` before the looks.
       seen: `[M]` bool, which modalities have looked before.
       features: for each modality `[D_m]` new features, or None where it has not looked.
@@ -237,7 +230,6 @@ class Filter(Reader):
         Args:
           params: of the networks, by modality.
           features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
-          modality: index of the sensor; static.
         """
         moments = self.readout.of_classes
         network = MLP(self.hidden, moments.shape[1])

@@ -116,8 +116,6 @@ def encode(
     """`[D]` mean and log-variance of the posterior `q(z | present features)`.
 
     Args:
-      params: from `init` or `train`.
-      model: the shape.
       features: for each modality `[D_m]`, or None where it is missing.
 
     Raises:
@@ -189,12 +187,9 @@ def losses(
 
     Args:
       noise: standard normal draws, for z.
-      params: from `init`.
-      model: the shape.
       features: of every modality.
       alpha: weight of the divergences to the subsets' encoders.
       beta: weight of the divergence to the prior.
-      reconstruction_weights: w_m.
 
     Returns:
       Losses, and their parts: `reconstruction`, which is weighted, `prior` and `subsets`.
@@ -266,9 +261,6 @@ def train(
     """Trains a JMVAE on features.
 
     Args:
-      key: random key.
-      params: from `init`.
-      model: the shape.
       bank: for each modality `[C, S, D_m]` features of looks at every class. Each example is a look
         by every modality at one class. Rows that belong together, such as views of one object, are
         classes with a look each: `[N, 1, D_m]`.
@@ -340,9 +332,6 @@ def log_likelihood(
     bring it closer. For the likelihood of features given others, subtract that of the others.
 
     Args:
-      key: of the draws.
-      params: from `train`.
-      model: the shape.
       features: for each modality `[D_m]`, or None where it is missing.
       reconstruction_weights: of the training, the inverse variance of each modality's features
         given the latents.

@@ -101,14 +101,12 @@ def losses(
 
     Args:
       noise: `[M, D, B, K]` standard normal draws.
-      params: from `init`.
       model: its shape; the features of a modality are a look in the frame of its sensor.
       looks: K looks, two or more, by each sensor at each of B PoIs.
       alpha: weight of the divergences to the posteriors of fewer looks.
       beta: weight of the divergences from the prior.
       has_begun: from 0, where the divergences' gradient to the posterior of all looks is stopped,
         to 1.
-      reconstruction_weights: w_m.
     """
     number = looks[0].shape[1]
     columns = [jnp.moveaxis(x, -1, 0) for x in looks]  # [F, B, K]
@@ -193,7 +191,6 @@ class Encoder:
       readout: reads class probabilities from posteriors.
       prior: `[D]` belief before any look.
       sharpness: `[]` factor on the log-probabilities of the labels, see `calibrate`.
-      model: shape of the JMVAE.
       label_of_class: label of each class, which names what it has learned.
     """
 

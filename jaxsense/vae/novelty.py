@@ -46,7 +46,6 @@ class Novelty:
         Args:
           apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
             infinite for none.
-          modality: index of the sensor.
         """
         return _weight(apart, self.strength[modality], self.length[modality])
 

@@ -1,4 +1,4 @@
-"""Class probabilities as a belief, and what a belief says about the classes.
+"""Class probabilities: exact Bayes, held as a belief, and read from a belief.
 
 The Gaussian with the moments of the mixture `sum_c w_c q*_c` of the classes' joint posteriors holds
 the probabilities `w_c`: its mean and mean square are linear in them. Of all probabilities with
@@ -13,11 +13,12 @@ from collections.abc import Sequence
 import chex
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, product, pytree
 
+_MIN_FEATURE = 1e-12  # that a class is not excluded by
 _MIN_PROBABILITY = 1e-6  # that can be read; float32 moments hold no smaller ones
 _PLAUSIBLE_DISTANCE = 2.0  # standard deviations
 _STEPS = 25  # of Newton's method
@@ -25,6 +26,60 @@ _LONGEST = 2.0  # step, in whitened coordinates; with longer ones it diverges ne
 _DAMPING = 1e-5
 _MAX_UNROLLED = 4  # eliminations; a program with many takes minutes to compile
 _THRESHOLD = 0.05  # of the largest singular value; smaller differences of moments are noise
+
+
+@pytree
+class Bayes:
+    """Exact Bayes over the classes; `labels` `[M, C]` int32 of each class in each modality."""
+
+    labels: Int[Array, "M C"]
+
+    @property
+    def prior(self) -> Float[Array, " C"]:
+        """Logarithms of equal probabilities."""
+        number = self.labels.shape[1]
+        return jnp.full(number, -jnp.log(number), jnp.float32)
+
+    def log_likelihoods(self, features: Float[Array, " D_m"], modality: int) -> Float[Array, " C"]:
+        """Log-likelihood of each class given one look, up to a constant.
+
+        In the detector's training each label was as frequent as the classes that have it, so
+        `p(x | class) ~ p(label | x) / p(label)`.
+
+        Args:
+          features: probabilities of the labels.
+
+        Raises:
+          ValueError: if the features are not probabilities.
+        """
+        chex.assert_rank(features, 1)
+        checks.require_probabilities("features", features)
+        labels = self.labels[modality]
+        prior = jnp.zeros(len(features)).at[labels].add(1 / len(labels))
+        return jnp.log(jnp.maximum(features[labels], _MIN_FEATURE) / prior[labels])
+
+    def update(
+        self,
+        log_posterior: Float[Array, " C"],
+        features: Float[Array, " D_m"],
+        modality: int,
+        weight: Float[Array, ""] | float = 1.0,
+    ) -> Float[Array, " C"]:
+        """Normalised logarithms of the classes' probabilities after one more look.
+
+        Args:
+          log_posterior: logarithms before the look.
+          features: see `log_likelihoods`.
+          weight: share of the look that is new evidence, see `vae.Novelty`.
+
+        Raises:
+          ValueError: if all classes are excluded or a logarithm is NaN; see also `log_likelihoods`.
+        """
+        chex.assert_shape(log_posterior, self.labels.shape[1:])
+        # Rejects -inf (all classes excluded) and NaN.
+        checks.require_finite("largest of log_posterior", jnp.max(log_posterior))
+        found = self.log_likelihoods(features, modality)
+        return jax.nn.log_softmax(log_posterior + weight * found)
 
 
 @checks.typed

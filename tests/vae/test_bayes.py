@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense.vae.bayes import Bayes
+from jaxsense.vae.readout import Bayes
 
 # Red or green, cylinder or cube: classes are green cylinder, red cylinder, red cube.
 EXACT = Bayes(jnp.array([[1, 0, 0], [0, 0, 1]]))

@@ -13,8 +13,8 @@ from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.vae import fusion
-from jaxsense.vae.bayes import Bayes
 from jaxsense.vae.jmvae import Jmvae
+from jaxsense.vae.readout import Bayes
 
 # Red or green, cylinder or cube: classes are green cylinder, red cylinder, red cube.
 MODEL = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
