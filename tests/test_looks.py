@@ -12,19 +12,17 @@ import jaxsense
 from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
-from jaxsense.core import supervised
 from jaxsense.core.types import Belief
 from jaxsense.dqn import map_mdp, rewards
 from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
-from jaxsense.vae import detectors, fusion, jmvae
+from jaxsense.vae import fusion, jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = replace(PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(8,)))
 MODEL = Jmvae(CONFIG.modalities, (2, 2), 2, (8,))
 NUM_LOOKS = 1024
-PARTS = slice(500), slice(500, None)
 
 
 @pytest.fixture(scope="module")
@@ -144,47 +142,14 @@ def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(model
         assert outcome.reward == pytest.approx(before - after - 0.0625, abs=1e-4)
 
 
-@pytest.fixture(scope="module")
-def world():
-    return worlds.make_world(CONFIG)
+@pytest.mark.slow
+@pytest.mark.parametrize("modality", [0, 1])
+def test_live_and_bank_features_have_the_same_distribution(modality):
+    config, models = jaxsense.load_pretrained("noisy")
+    live = Live(worlds.make_world(config), models.detectors)
 
-
-@pytest.fixture(scope="module")
-def trained(world):
-    """For each modality a detector of a short training, its training windows and new ones."""
-    number = 500 + NUM_LOOKS
-
-    def survey(key):
-        class_key, survey_key = jax.random.split(key)
-        classes = looks.balanced_classes(class_key, CONFIG, number)
-        keys = jax.random.split(survey_key, number)
-        return classes, *looks.surveys(keys, world, classes)[1:]
-
-    classes, surveyed, distances = jax.jit(survey)(jax.random.key(0))
-    config, found = replace(CONFIG.detector, steps=200), []
-    for m, name in enumerate(CONFIG.modalities):
-        given = detectors.Looks(surveyed[m], distances[:, m])
-        by_class = jax.tree.map(lambda x: jnp.stack([x[classes == c] for c in range(3)]), given)
-        windows, new = (jax.tree.map(lambda x: x[:, part], by_class) for part in PARTS)  # noqa: B023
-        flat = jax.tree.map(lambda x: x.reshape(1500, *x.shape[2:]), windows)
-        labels = jnp.array(CONFIG.label_of_class(name))
-        detector = detectors.init(jax.random.key(1), flat.windows, 2, config)
-        nothing = replace(flat, windows=jnp.zeros_like(flat.windows))
-        labels = jnp.repeat(labels, 500)
-        problem = detectors.Fitting(config, detector, flat, labels, nothing)
-        start = supervised.start(detector.params, config)
-        fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, 200))  # noqa: B023
-        state, _ = fit(jax.random.key(2), start)
-        found.append((replace(detector, params=state.params), windows.windows, new))
-    return found
-
-
-@pytest.fixture(scope="module")
-def look_live(trained, world):
-    """A modality's live features of `[S]` looks, and their classes."""
-    live = Live(world, tuple(found[0] for found in trained))
-
-    def look_thrice(key, modality):
+    def look_thrice(key):
+        """The class and the features of the last look of an episode."""
         class_key, poi_key, scene_key, look_key = jax.random.split(key, 4)
         classes = jax.random.randint(class_key, (3,), 0, 3)
         pois = jax.random.randint(poi_key, (3,), 0, 3)
@@ -196,44 +161,13 @@ def look_live(trained, world):
 
         scene = live.scene(scene_key, classes)
         _, seen = jax.lax.scan(look, scene, (jax.random.split(look_key, 3), pois))
-        return jax.tree.map(lambda x: x[-1], seen)  # the last look of an episode
+        return jax.tree.map(lambda x: x[-1], seen)
 
     keys = jax.random.split(jax.random.key(3), NUM_LOOKS)
-    return lambda modality: jax.jit(jax.vmap(lambda key: look_thrice(key, modality)))(keys)
-
-
-@pytest.fixture(scope="module", params=[0, 1], ids=CONFIG.modalities)
-def windows_of(request, trained):
-    """A modality, its detector, the detector's training windows and new ones."""
-    return request.param, *trained[request.param]
-
-
-@pytest.fixture(scope="module")
-def features(windows_of, look_live):
-    """A modality, and features `[C, S, 2]` from the bank and, live, with their `[S]` classes."""
-    modality, detector, _, new = windows_of
-    bank = jax.jit(jax.vmap(jax.vmap(detectors.features, (None, 0, 0)), (None, 0, 0)))
-    found = np.asarray(bank(detector, new.windows, new.distances))
-    return modality, found, jax.tree.map(np.asarray, look_live(modality))
-
-
-@pytest.mark.slow
-def test_a_short_training_tells_most_looks_apart(features):
-    modality, bank, (classes, live) = features
-    labels = np.array(CONFIG.label_of_class(CONFIG.modalities[modality]))
-    of_bank = np.mean(bank.argmax(axis=-1) == labels[:, None])
-    of_live = np.mean(live.argmax(axis=-1) == labels[classes])
-    assert of_bank > 0.9
-    # Four standard errors of a share at worst .9, of 3 x 1024 and of 1024 looks.
-    error = np.sqrt(0.9 * 0.1 * (1 / bank[..., 0].size + 1 / len(live)))
-    np.testing.assert_allclose(of_live, of_bank, atol=4 * error)
-
-
-@pytest.mark.slow
-def test_live_and_bank_features_have_the_same_distribution(features):
-    _, bank, (classes, live) = features
+    classes, found = jax.tree.map(np.asarray, jax.jit(jax.vmap(look_thrice))(keys))
+    bank = np.asarray(jaxsense.detections(jax.random.key(0), config, models, NUM_LOOKS)[modality])
     for c in range(3):
-        here, there = live[classes == c, 0], bank[c, :, 0]
+        here, there = found[classes == c, 0], bank[c, :, 0]
         # Kolmogorov-Smirnov: the largest gap of the distribution functions; 1.95 is p = .001.
         values = np.concatenate([here, there])
         gaps = [np.searchsorted(np.sort(x), values, side="right") / len(x) for x in (here, there)]

@@ -2,16 +2,13 @@
 
 import ast
 import contextlib
-import json
 import time
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from refusals import ANYTHING, NUMBERS, SMOKE, check_message
+from refusals import NUMBERS, SMOKE, check_message
 from smoke import save_models
 from untrained import untrained
 
@@ -22,7 +19,7 @@ from jaxsense.run import pipeline
 from jaxsense.run.files import WriteError
 from jaxsense.run.monitor import StageError
 from jaxsense.run.rundir import RunDirectory
-from jaxsense.run.settings import Settings, read_settings
+from jaxsense.run.settings import Settings
 
 SECONDS = 10.0
 
@@ -51,15 +48,10 @@ def place(tmp_path, monkeypatch):
         "utf16": '{"seed": 1}'.encode("utf-16"),
         "deep": b"[" * 100_000,
         "twice": b'{"preset": "smoke", "seed": 1, "seed": 2}',
-        "empty": b"",
-        "list": b"[]",
         "nan": b'{"config": {"jmvae": {"beta": NaN}}}',
         "float": b'{"seed": 1.0}',
-        "large": b'{"seed": 4294967296}',
-        "section": b'{"config": {"dqn": [1]}}',
         "field": b'{"config": {"dqn": {"epoch": 3}}}',
         "unknown": b'{"colour": 3}',
-        "whole": b'{"config": {"dqn": {"epochs": 60.0}}}',
         "sensor": b'{"config": {"sensors": {"x": {"make": "a:b"}}}}',
     }
     for name, text in texts.items():
@@ -165,19 +157,12 @@ def test_other_commands_refuse(program, argv, expected, run, place, capsys):
     assert contents(run) == before
 
 
-SUMMARIES = [
-    (b"{}", "must hold the summary.json of a finished run"),
-    (b"\xff", "must hold the summary.json of a finished run"),
-]
-
-
-@pytest.mark.parametrize(("summary", "expected"), SUMMARIES, ids=count())
-def test_evaluate_refuses_a_broken_summary(summary, expected, run, capsys):
+@pytest.mark.parametrize("summary", [b"{}", b"\xff"])
+def test_evaluate_refuses_a_broken_summary(summary, run, capsys):
     (run / "summary.json").write_bytes(summary)
-    try:
-        assert expected in refusal(evaluate.main, [str(run)], run, capsys)
-    finally:
-        (run / "summary.json").unlink()
+    told = refusal(evaluate.main, [str(run)], run, capsys)
+    (run / "summary.json").unlink()
+    assert "must hold the summary.json of a finished run" in told
 
 
 @pytest.mark.parametrize(
@@ -218,14 +203,3 @@ def test_text_is_read_and_written_as_utf_8():
                 is_binary = any("b" in str(getattr(arg, "value", "")) for arg in node.args)
                 is_of_zip = ast.unparse(node.func) == "files.open"  # always binary
                 assert "encoding" in named or is_binary or is_of_zip, f"{file}:{node.lineno}"
-
-
-@settings(max_examples=25, deadline=None, derandomize=True, database=None)
-@given(st.dictionaries(st.sampled_from(["preset", "seed", "config", "x"]), ANYTHING))
-def test_any_config_file_is_read_or_refused(tmp_path_factory, content):
-    file = tmp_path_factory.getbasetemp() / "any.json"
-    file.write_text(json.dumps(content))
-    try:
-        assert isinstance(read_settings(file), Settings)
-    except ConfigError as error:
-        check_message(str(error))

@@ -14,10 +14,8 @@ from exporting import CONFIG, drawn
 import jaxsense
 from jaxsense import export
 from jaxsense.config import PRESETS
-from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn import Travel, team_mdp
-from jaxsense.dqn.map_agent import observation
+from jaxsense.dqn import Travel
 from jaxsense.interfaces import robot
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
@@ -98,53 +96,6 @@ def test_a_detector_answers_what_is_not_there(loaded, m):
         assert np.isfinite(found["features"]).all()
         if not is_there:
             np.testing.assert_allclose(found["features"], 0.5)
-
-
-def test_decisions_are_those_of_the_policy_and_the_rules(models, loaded):
-    network = MLP(CONFIG.dqn.hidden, CONFIG.arena.num_pois + 1)
-    classes = models.fusion.classes
-    assert CONFIG.mission.auctions
-
-    apply = jax.jit(lambda params, belief: network.apply(params, observation(belief)))
-    seconds = jax.jit(lambda pose, place: team_mdp.travel_seconds(TRAVEL, pose, place))
-    means, stds = np.asarray(classes.mean), np.asarray(classes.std)
-
-    def values_of(mean, std, present, m):
-        # A mean over all classes that a PoI which is not present may have.
-        is_there = present[:, None]
-        of_each = [
-            apply(
-                models.q_networks[m],
-                Belief(np.where(is_there, mean, means[c]), np.where(is_there, std, stds[c])),
-            )
-            for c in range(len(means))
-        ]
-        return np.where(np.append(present, True), np.mean(of_each, axis=0), -np.inf)
-
-    def decide(mean, std, looked_from, robot, positions, present, poses, modality, works, target):
-        values = values_of(mean, std, present, modality[robot])
-        bids = {}
-        for r, poi in np.ndindex(SIZES["robots"], SIZES["pois"]):
-            only = present & (np.arange(SIZES["pois"]) == poi)
-            alone = values_of(mean, std, only, modality[r])
-            apart = np.linalg.norm(poses[r, :2] - looked_from[poi, modality[r]], axis=-1)
-            way = models.novelty.to_go(apart, modality[r]) / TRAVEL.speed
-            there = seconds(poses[r], positions[poi][None])
-            if only.any() and alone[poi] > alone[-1]:
-                bids[r, poi] = float(there[0] + way)
-        of_robot = {poi: time for (r, poi), time in bids.items() if r == robot}
-        bids, won = {(r, n): x for (r, n), x in bids.items() if works[r]}, {}
-        while bids:
-            r, n = min(bids, key=bids.get)
-            won[r] = n
-            bids = {(i, j): x for (i, j), x in bids.items() if i != r and j != n}
-        taken = [target[r] for r in range(SIZES["robots"]) if works[r] and r != robot]
-        cost = {n: time + 100 * (n in taken) for n, time in of_robot.items()}
-        nearest = min(cost, key=cost.get) if cost else SIZES["pois"]
-        return won.get(int(robot), nearest), values
-
-    rows = check(loaded, "decide", decide, "action", "values")
-    assert len({int(row["action"]) for row in rows}) > 1
 
 
 def test_the_map_is_read_as_jaxsense_reads_it(models, loaded):
