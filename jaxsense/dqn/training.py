@@ -23,6 +23,8 @@ from jaxsense.dqn.map_mdp import MapMdp, Outcome
 from jaxsense.dqn.team_mdp import TeamMdp
 
 S = TypeVar("S")
+Evaluate = Callable[[Key, Params], jax.Array]
+"""`(key, parameters) -> []` total reward of the learned policy."""
 _EVALUATED = 10  # epochs
 _FIRST_EPSILON = 1.0
 _FINAL_RATE = 0.01  # share of the learning rate that is left in the last epoch
@@ -181,23 +183,26 @@ def train_chunk(
     config: DqnConfig,
     state: DqnState[S],
     prepared: S,
-    evaluate: Callable[[Key, Params], jax.Array] | None = None,
+    evaluation: Callable[[Key], Evaluate] | None = None,
 ) -> tuple[DqnState[S], EpochInfo]:
     """Trains for `config.chunk` epochs.
 
     Args:
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
         episode from a random one of its share.
-      evaluate: `(key, parameters) -> []` total reward of the learned policy, called after every
-        tenth epoch, or after the last if ten do not divide the chunk.
+      evaluation: prepares for the chunk what is called after every tenth epoch, or after the last
+        if ten do not divide the chunk.
     """
     chex.assert_tree_shape_prefix(prepared, (config.num_starts,))
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     *draw_keys, evaluation_key = jax.random.split(key, 4)
     draws = _draw(draw_keys, config)
     epoch = functools.partial(_epoch, environment, config, shares)
-    if evaluate is None:
+    if evaluation is None:
         return jax.lax.scan(epoch, state, draws)
+    # Once a chunk: a start simulates all earlier looks, an episode only a few.
+    start_key, evaluation_key = jax.random.split(evaluation_key)
+    evaluate = evaluation(start_key)
     every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
 
     def advance(state: DqnState[S], of_group: tuple[Key, _Draws]) -> tuple[DqnState[S], EpochInfo]:

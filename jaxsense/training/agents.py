@@ -163,12 +163,9 @@ def _advance(
     **inputs: Output,
 ) -> tuple[State, Progress]:
     mdp = held_out_mdp(config, inputs["fusion"], inputs["detections"])
-
-    def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-        return comparison.learned_return(key, modality, q_network, mdp, config)
-
+    evaluation = comparison.evaluation(modality, mdp, config)
     learning = _environment(arena, config, modality, **inputs)
-    state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluate)
+    state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluation)
     reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
     loss = jnp.where(info.is_finite, info.loss, jnp.nan)
     metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}

@@ -13,7 +13,8 @@ from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn import episodes, policies
-from jaxsense.dqn.episodes import reference
+from jaxsense.dqn import training as dqn
+from jaxsense.dqn.episodes import Start, reference
 from jaxsense.dqn.map_mdp import Looks, MapMdp, random_start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Policy, Values
@@ -69,24 +70,34 @@ def held_out_mdp(
     return dataclasses.replace(mdp, num_pois=number)
 
 
-def learned_return(
-    key: Key, modality: Int[Array, ""], q_network: Params, mdp: MapMdp, config: Config
-) -> Float[Array, ""]:
-    """Mean total reward of a Q-network's policy, in one episode from each of random starts."""
-    agent, exact = make_agent(config), make_bayes(config)
+def evaluation(
+    modality: Int[Array, ""], mdp: MapMdp, config: Config
+) -> Callable[[Key], dqn.Evaluate]:
+    """The mean total reward of a Q-network's policy, in one episode from each of random starts.
 
-    def act(key: Key, known: Known) -> jax.Array:
-        del key
-        classes = mdp.fusion.classes
-        values = agent.decide(q_network, (), classes, known.belief, known.team, known.robot)
-        return policies.best(values)
+    The first key draws the starts; the second, in each call, the looks.
+    """
+    agent, exact, number = make_agent(config), make_bayes(config), config.evaluation.num_starts
 
-    def episode(key: Key) -> jax.Array:
-        reset_key, episode_key = jax.random.split(key)
-        start = episodes.reset(reset_key, mdp, exact)
-        return episodes.run_episode(episode_key, mdp, exact, act, start, modality)[0]
+    def prepare(key: Key) -> dqn.Evaluate:
+        reset = jax.vmap(lambda key: episodes.reset(key, mdp, exact))
+        starts = reset(jax.random.split(key, number))
 
-    return jnp.mean(jax.vmap(episode)(jax.random.split(key, config.evaluation.num_starts)))
+        def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
+            def act(key: Key, known: Known) -> jax.Array:
+                del key
+                classes = mdp.fusion.classes
+                values = agent.decide(q_network, (), classes, known.belief, known.team, known.robot)
+                return policies.best(values)
+
+            def episode(key: Key, start: Start) -> jax.Array:
+                return episodes.run_episode(key, mdp, exact, act, start, modality)[0]
+
+            return jnp.mean(jax.vmap(episode)(jax.random.split(key, number), starts))
+
+        return evaluate
+
+    return prepare
 
 
 def compare_policies(
@@ -117,44 +128,53 @@ def compare_policies(
     optimal = reference(table_key, mdp, modality, models, models.bayes.labels)
     table, names = policies.table(own), (*COMPARED, *(own or {}))
     looks = jnp.sum(starts[1][..., modality], axis=-1)
-    often = jnp.array([name in _STATE_BY_STATE for name in names])
+    often, seldom = settings.num_repeats, -(-settings.num_repeats // 8)
+    numbers = jnp.stack([often if name in _STATE_BY_STATE else seldom for name in names])
 
-    # By a switch, so that one program is compiled for all policies.
-    def with_policy(which: Int[Array, ""]) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-        number = jnp.where(often[which], settings.num_repeats, -(-settings.num_repeats // 8))
+    def begin(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[Key, Start]:
+        reset_key, episode_key = jax.random.split(key)
+        return episode_key, episodes.reset(reset_key, mdp, models.bayes, classes, seen)
 
-        def episode(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
-            reset_key, episode_key = jax.random.split(key)
-            start = episodes.reset(reset_key, mdp, models.bayes, classes, seen)
+    def episode(which: Int[Array, ""], key: Key, start: Start) -> tuple[jax.Array, jax.Array]:
+        def act(key: Key, known: Known) -> jax.Array:
+            of_each = [
+                functools.partial(optimal, known, start.state.classes)
+                if name == "optimal"
+                else functools.partial(table[name].values, key, models, known)
+                for name in names
+            ]
+            # By a switch, so that one program is compiled for all policies.
+            return policies.best(jax.lax.switch(which, of_each))
 
-            def act(key: Key, known: Known) -> jax.Array:
-                of_each = [
-                    functools.partial(optimal, known, classes)
-                    if name == "optimal"
-                    else functools.partial(table[name].values, key, models, known)
-                    for name in names
-                ]
-                return policies.best(jax.lax.switch(which, of_each))
+        return episodes.run_episode(key, mdp, models.bayes, act, start, modality)
 
-            return episodes.run_episode(episode_key, mdp, models.bayes, act, start, modality)
+    def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        keys = jax.random.split(jax.random.fold_in(play_key, i), len(starts[0]))
+        begun = jax.vmap(begin)(keys, *starts)
 
-        def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            keys = jax.random.split(jax.random.fold_in(play_key, i), len(starts[0]))
-            played = _in_groups(jax.vmap(episode), looks, (keys, *starts))
-            return jax.tree.map(jnp.add, sums, played)
+        def with_policy(
+            given: tuple[jax.Array, tuple[jax.Array, jax.Array]],
+        ) -> tuple[jax.Array, jax.Array]:
+            which, sums = given
 
-        zero = jnp.zeros(len(starts[0]))
-        total, first = jax.lax.fori_loop(0, number, repeat, (zero, zero))
-        return total / number, first / number
+            def play() -> tuple[jax.Array, jax.Array]:
+                found = _in_groups(jax.vmap(functools.partial(episode, which)), looks, begun)
+                return jax.tree.map(jnp.add, sums, found)
 
-    total, first = jax.lax.map(with_policy, jnp.arange(len(names)))
+            return jax.lax.cond(i < numbers[which], play, lambda: sums)
+
+        return jax.lax.map(with_policy, (jnp.arange(len(names)), sums))
+
+    zero = jnp.zeros((len(names), len(starts[0])))
+    sums = jax.lax.fori_loop(0, often, repeat, (zero, zero))
+    total, first = (x / numbers[:, None] for x in sums)
     return {name: (total[i], first[i]) for i, name in enumerate(names)}
 
 
 def _in_groups(
     play: Callable[..., tuple[jax.Array, jax.Array]],
     looks: Int[Array, " S"],
-    starts: tuple[jax.Array, ...],
+    begun: tuple[Key, Start],
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
     """Plays episodes on a CPU group by group, so that short ones need not wait for long ones.
 
@@ -162,10 +182,10 @@ def _in_groups(
     """
     number = len(looks) // _LEAST_GROUP if jax.default_backend() == "cpu" else 1
     if number <= 1:
-        return play(*starts)
+        return play(*begun)
     # Some episodes are played twice where the groups do not divide them.
     rows = jnp.resize(jnp.argsort(looks), (number, -(-len(looks) // number)))
-    found = jax.lax.map(lambda of: play(*(x[of] for x in starts)), rows)
+    found = jax.lax.map(lambda of: play(*jax.tree.map(lambda x: x[of], begun)), rows)
     return jax.tree.map(jnp.zeros(len(looks)).at[rows].set, found)
 
 

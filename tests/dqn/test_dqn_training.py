@@ -242,17 +242,17 @@ def length_of(key, params):
     return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(params))
 
 
-@functools.partial(jax.jit, static_argnames="evaluate", compiler_options=FAST_TO_COMPILE)
-def train_from_epoch_5(config, evaluate):
+@functools.partial(jax.jit, static_argnames="evaluation", compiler_options=FAST_TO_COMPILE)
+def train_from_epoch_5(config, evaluation):
     prepared = training.starts(jax.random.key(2), LEARNING, config)
     state = training.init(jax.random.key(0), LEARNING, config, prepared)
     state = replace(state, epoch=jnp.int32(5))
-    return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluate)
+    return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluation)
 
 
 def trained_for(chunk, evaluate, **settings):
     """The state and the infos after one chunk of a small training, which begins at epoch 5."""
-    return train_from_epoch_5(replace(SMALL, epochs=chunk, **settings), evaluate)
+    return train_from_epoch_5(replace(SMALL, epochs=chunk, **settings), lambda key: evaluate)
 
 
 def test_the_policy_is_evaluated_after_every_tenth_epoch():

@@ -57,20 +57,23 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     bank, held_out = (tuple(jnp.full((3, 4, 2), x) for _ in range(2)) for x in (0.5, 0.25))
     used = {}
 
-    def train_chunk(key, learning, config, state, starts, evaluate):
+    def train_chunk(key, learning, config, state, starts, evaluation):
         used["learning"], used["modality"] = learning.mdp.looks.features, learning.modality
-        evaluate(key, "network")
+        evaluation(key)(key, "network")
         return state, SimpleNamespace(
             episodes=jnp.array([2, 0]), episode_return=jnp.array([1.5, 9.0]),
             is_finite=jnp.array([True, False]), loss=jnp.array([0.5, 0.25]),
             evaluation_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
         )  # fmt: skip
 
-    def learned_return(key, modality, q_network, mdp, config):
-        used["evaluation"], used["of"] = mdp.looks.features, (int(modality), q_network)
+    def evaluation(modality, mdp, config):
+        def evaluate(key, q_network):
+            used["evaluation"], used["of"] = mdp.looks.features, (int(modality), q_network)
+
+        return lambda key: evaluate
 
     monkeypatch.setattr(dqn, "train_chunk", train_chunk)
-    monkeypatch.setattr(comparison, "learned_return", learned_return)
+    monkeypatch.setattr(comparison, "evaluation", evaluation)
     stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
     found = {
         "starts": None,
