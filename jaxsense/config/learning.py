@@ -197,7 +197,7 @@ class DqnConfig(Section, place="dqn"):
     """Sizes of the hidden layers."""
     num_envs: int = limited(512, at_least=1)
     """Number of environments that step in parallel."""
-    epochs: int = limited(800, at_least=1)
+    epochs: int = limited(200, at_least=1)
     """Number of epochs, each of one step per environment and `dqn.updates` gradient steps."""
     updates: int = limited(64, at_least=1)
     """Gradient steps per epoch."""

@@ -315,7 +315,7 @@ _NOISY = Config(
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
-    dqn=DqnConfig(observe="bank", discount=0.2),
+    dqn=DqnConfig(observe="bank", epochs=800, discount=0.2),
     team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_looks=128),
     navigation=NavigationConfig(view_range=4.0),
@@ -345,6 +345,7 @@ _RAW = Config(
         steps=4000,
         batch=128,
     ),
+    dqn=DqnConfig(epochs=800),
 )
 
 _TEAM = Config(
