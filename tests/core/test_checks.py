@@ -10,7 +10,7 @@ import pytest
 
 import jaxsense
 from jaxsense import dqn, interfaces, mission, sim, vae
-from jaxsense.core import checks
+from jaxsense.core import checks, inside
 
 
 @pytest.mark.parametrize(
@@ -69,3 +69,17 @@ def test_every_function_refuses_a_seed_as_its_key(function, arguments, by_name):
     # Before it looks at anything else.
     with pytest.raises(ValueError, match=re.escape("key = 7: must be one key")):
         function(7, *arguments, **by_name)
+
+
+@pytest.mark.parametrize("values", [3, "ab", [1.0]])
+def test_one_value_for_each_modality(values):
+    checks.require_one_each("x", [1.0, 2.0], ("camera", "lidar"))
+    with pytest.raises(ValueError, match=r"^x .*2, one for each of \('camera', 'lidar'\)"):
+        checks.require_one_each("x", values, ("camera", "lidar"))
+
+
+def test_a_file_may_be_as_large_as_is_allowed(tmp_path):
+    (tmp_path / "x").write_bytes(b"1234")
+    assert inside.read(tmp_path / "x", most=4) == b"1234"
+    with pytest.raises(OSError, match="Larger than 3 bytes"):
+        inside.read(tmp_path / "x", most=3)

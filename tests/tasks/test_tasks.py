@@ -119,3 +119,8 @@ def test_a_task_is_frozen_from_models(tmp_path, monkeypatch):
     observed = jax.jit(jax.vmap(lambda key: task.reset(key)[0]))(keys)
     assert np.isfinite(observed).all()
     assert dataclasses.is_dataclass(task)
+
+
+def test_seeds_of_scores_are_keys_of_their_own():
+    numbers = jax.random.key_data(key_of_seed(3))
+    np.testing.assert_array_equal(numbers, [0, 2**31 + 3])
