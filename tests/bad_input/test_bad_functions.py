@@ -15,7 +15,7 @@ from jaxsense import Belief, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.dqn import replay
 from jaxsense.dqn.optimum import interpolate
 from jaxsense.dqn.rewards import information
-from jaxsense.mission import begin, roadmap
+from jaxsense.mission import begin
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.sim.light import random_light
 from jaxsense.vae import fusion
@@ -138,10 +138,6 @@ FUNCTIONS = {
         lambda w: tasks.mean_return(w.key, "map-v0", nop, 0),
         "episodes = 0: must be a whole number greater than 0",
     ),
-    "mean_return key": (
-        lambda w: tasks.mean_return(7, "map-v0", nop, 2),
-        "key = 7: must be one key, as from jax.random.key(0)",
-    ),
     "task step team": (
         lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0),
         ": must be TeamState, as from reset",
@@ -162,10 +158,6 @@ FUNCTIONS = {
         lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD),
         "classes = 7: must be a whole number from 0 to 2",
     ),
-    "roadmap batch": (
-        lambda w: roadmap.build(SMOKE, jax.tree.map(lambda x: x[None], w.scene.layout)),
-        "layout.position has the shape (1, 3, 2): must be (3, 2); use jax.vmap for a batch",
-    ),
     "look poi": (
         lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)),
         "poi = 3: must be a whole number from 0 to 2",
@@ -177,10 +169,6 @@ FUNCTIONS = {
     "value_iteration sum": (
         lambda w: value_iteration(w, start=jnp.array([0.75, 0.5])),
         "sum of start = 1.25: must be 1",
-    ),
-    "value_iteration wide": (
-        lambda w: value_iteration(w, start=jnp.full(3, 1 / 3)),
-        "start has the shape (3,): must be (2,)",
     ),
     "models.detect length": (
         lambda w: w.models.detect(1, w.lidar, np.ones(720), 0.0, 1.0),
@@ -211,10 +199,6 @@ FUNCTIONS = {
     "posterior batch": (
         lambda w: vae.posterior(w.params, w.model, (w.x[None], w.x[None])),
         "features of camera has the shape (1, 2): must be (2,); use jax.vmap for a batch",
-    ),
-    "class_probabilities batch": (
-        lambda w: w.filter.class_probabilities(Belief(jnp.zeros((4, 2)), jnp.ones((4, 2)))),
-        "belief.mean has the shape (4, 2): must be (2,); use jax.vmap for a batch",
     ),
     "update weight": (
         lambda w: w.filter.update(w.belief, w.seen, w.look, 0, NAN),

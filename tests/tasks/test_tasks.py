@@ -27,24 +27,6 @@ def programs(name, agent=None):
     return task, jax.jit(task.reset), jax.jit(task.step)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_episode_goes_from_reset_to_nop(name):
-    task, reset, step = programs(name)
-    observation, state = reset(KEY)
-    assert observation.shape == (task.observation_size,)
-    assert observation.dtype == jnp.float32
-    assert task.action_mask(state).shape == (task.num_actions,)
-    assert task.action_mask(state)[-1]
-    state, first = step(KEY, state, 0)
-    assert np.isfinite(first.reward)
-    assert not first.terminated
-    assert not np.array_equal(first.observation, observation)
-    robots = 2 if name == "team-v0" else 1
-    for left in reversed(range(robots)):
-        state, last = step(KEY, state, task.num_actions - 1)
-        assert bool(last.terminated) == (left == 0)
-
-
 def test_a_team_pays_for_the_time_of_all_robots():
     task, reset, step = programs("team-v0")
     _, state = reset(KEY)
