@@ -24,13 +24,14 @@ from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.windows import Domain, make_domain
 from jaxsense.vae import detectors, frames, fusion, jmvae, leave_one_out, novelty, readout
 from jaxsense.vae.detectors import Classifier, Detection, Detector
-from jaxsense.vae.frames import Frame, Scaling
+from jaxsense.vae.frames import Chromaticity, Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.leave_one_out import Encoder
 from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Bayes, Readout
 
 _NO_SEARCH = Search()
+_FEWEST_BEAMS = 3  # fewer show no profile
 _UNSEEN_VARIANCE = 20.0  # of each latent dimension of the belief before any look
 
 
@@ -151,20 +152,18 @@ def make_jmvae(config: Config) -> Jmvae:
 
 def make_frame(config: Config, sensor: Sensor) -> Frame:
     """How a network that learns from scans sees the windows of a sensor."""
+    if sensor.channels == 3:
+        return Chromaticity()
+    if not sensor.measures_distance or sensor.channels > 1 or sensor.window < _FEWEST_BEAMS:
+        return Frame()
     span = (sensor.window - 1) * sensor.stride
     start = (len(sensor.angles) - 1 - span) // 2
     angles = sensor.angles[start : start + span + 1 : sensor.stride]
     # Near the edge of the field of view, a window ends at the last ray, off the PoI's bearing.
     margin = (np.ptp(sensor.angles) - np.ptp(angles)) / 2
-    viewpoint = config.viewpoint
     off = jnp.maximum(0.0, jnp.radians(MAX_BEARING) - margin)
-    return frames.make(
-        angles,
-        sensor.channels,
-        sensor.measures_distance,
-        config.arena.poi_extent,
-        jnp.radians(viewpoint.bearing_error) + off,
-    )
+    error = jnp.radians(config.viewpoint.bearing_error) + off
+    return frames.profile(angles, config.arena.poi_extent, error)
 
 
 def make_scan_jmvae(config: Config) -> Jmvae:

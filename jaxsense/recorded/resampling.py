@@ -35,9 +35,6 @@ def resample(
       angles: `[A]` directions of the recorded rays in the same frame, in radians; two or more.
       readings: `[A, ...]` recorded distances in metres, or other readings.
       step: see `covered`.
-
-    Raises:
-      ValueError: if angles are not finite or beyond a turn, or readings are not one for each.
     """
     require_angles("angles", angles)
     if np.size(angles) < 2:
@@ -80,9 +77,6 @@ def close_gaps(
       ranges: `[A]` distances in metres; 0, infinite or NaN without a return.
       step: angle between the rays that are read later, in radians; beams farther apart than
         `MAX_STEPS` of it are no neighbours. By default the median one between beams.
-
-    Raises:
-      ValueError: if angles are not finite or beyond a turn, or distances are not one for each.
     """
     require_angles("angles", angles)
     ranges = with_returns(ranges)

@@ -191,9 +191,6 @@ def make_layout(
       position: centres of the PoIs, in metres from the arena's centre.
       yaw: in radians.
       classes: index of each PoI's class in `config.classes`.
-
-    Raises:
-      ValueError: if there is no such class.
     """
     chex.assert_shape(position, (config.num_pois, 2))
     chex.assert_shape([yaw, classes], (config.num_pois,))

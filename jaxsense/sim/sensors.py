@@ -162,34 +162,23 @@ class Lidar(Sensor):
     def read(
         self, key: Key, hits: raycast.Hit, surfaces: Surfaces, light: Light
     ) -> Float[Array, "B *channels"]:
-        """See `Sensor.read`."""
+        """Measured ranges; `max_range` without a return."""
         del surfaces, light
-        return measured_ranges(key, hits.distance, self.config)
+        config, met = self.config, hits.distance
+        spread = config.range_noise
+        if config.mixed_pixels > 0 or config.dropout > 0:
+            key, disturbance_key = jax.random.split(key)
+            met = _disturbed(disturbance_key, met, config)
+        if config.range_noise_growth > 0:
+            spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
+        noise = spread * jax.random.normal(key, met.shape)
+        measured = jnp.clip(met + noise, config.min_range, config.max_range)
+        return jnp.where(met <= config.max_range, measured, config.max_range)
 
     @property
     def reads_neighbours(self) -> bool:
         """See `Sensor.reads_neighbours`: whether there are mixed pixels."""
         return self.config.mixed_pixels > 0
-
-
-def measured_ranges(
-    key: Key, distance: Float[Array, "B"], config: LidarConfig
-) -> Float[Array, "B"]:
-    """Ranges that a laser scanner measures, in metres; `max_range` without a return.
-
-    Args:
-      distance: true distances along neighbouring beams, in metres; infinite without a hit.
-    """
-    chex.assert_rank(distance, 1)
-    met, spread = distance, config.range_noise
-    if config.mixed_pixels > 0 or config.dropout > 0:
-        key, disturbance_key = jax.random.split(key)
-        met = _disturbed(disturbance_key, distance, config)
-    if config.range_noise_growth > 0:
-        spread += config.range_noise_growth * jnp.minimum(met, config.max_range)
-    noise = spread * jax.random.normal(key, met.shape)
-    measured = jnp.clip(met + noise, config.min_range, config.max_range)
-    return jnp.where(met <= config.max_range, measured, config.max_range)
 
 
 def _disturbed(key: Key, distance: Float[Array, "B"], config: LidarConfig) -> Float[Array, "B"]:

@@ -129,9 +129,6 @@ def look(
     Returns:
       The detector's input and the expected distance of the PoI in metres, and the scene with the
       robot at its viewpoint.
-
-    Raises:
-      ValueError: if there is no such robot or PoI.
     """
     checks.require_key(key)
     if not 0 <= robot < len(world.sensors):

@@ -58,7 +58,8 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
       arena: from `sim.make_world(config)`.
     """
     scenes = drive(Stage("scenes", surveys.draw_scenes))
-    surveyed = drive(surveys.survey_stage(arena), scenes=scenes)
+    survey = functools.partial(surveys.survey, arena=arena)
+    surveyed = drive(Stage("survey", survey, finish=surveys.divide), scenes=scenes)
     examples = drive(Stage("examples", detections.looks_at_nothing), surveys=surveyed)
     perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
     detectors, params, classes, detected = perceive(
@@ -160,9 +161,6 @@ def learn(
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
       arena: from `sim.make_world(config)`; compiled anew by default.
       until: name of the last stage; all stages by default.
-
-    Raises:
-      ValueError: if `config` is no `Config`, or no stage has this name.
     """
     arena = _arena(config, arena)
     names = [stage.name for stage in stages(config, arena)]

@@ -9,7 +9,6 @@ from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training.stage import Stage
 from jaxsense.vae.detectors import Looks
 
 _SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
@@ -118,20 +117,16 @@ def draw_scenes(key: Key, config: Config) -> Scenes:
     return jax.random.split(scene_key, total), classes, is_empty, places
 
 
-def survey_stage(arena: Arena) -> Stage:
-    """Makes the stage that surveys all scenes together: compiling takes longer than running.
+def survey(key: Key, config: Config, *, arena: Arena, scenes: Scenes) -> Survey:
+    """Surveys all scenes together: compiling takes longer than running.
 
     It may get a part of the scenes, and knows nothing of their number.
     """
-
-    def survey(key: Key, config: Config, *, scenes: Scenes) -> Survey:
-        del key
-        keys, classes, is_empty, places = scenes
-        world = make_world(config, arena=arena)
-        seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
-        return Survey(classes, seen, windows, distances)
-
-    return Stage("survey", survey, finish=divide)
+    del key
+    keys, classes, is_empty, places = scenes
+    world = make_world(config, arena=arena)
+    seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
+    return Survey(classes, seen, windows, distances)
 
 
 def divide(config: Config, survey: Survey, **_: Scenes) -> Surveys:

@@ -73,12 +73,7 @@ class Detection:
 
 @pytree
 class Looks:
-    """Windows, and where each expects its PoI.
-
-    Attributes:
-      windows: `[S, F]`.
-      distances: `[S]` expected distances of the PoIs' centres, in metres.
-    """
+    """Windows, and the distance at which each expects the centre of its PoI, in metres."""
 
     windows: Float[Array, "S F"]
     distances: Float[Array, " S"]

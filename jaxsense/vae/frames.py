@@ -20,7 +20,6 @@ _BESIDE = 1.15  # half-widths within which it is
 _DEPTHS = -1.4, 2.1  # beyond which depth tells nothing of the PoI
 _AHEAD = 0.1  # rad, half the width of a PoI's front
 _NOTHING = 0.05  # beams, as many as which a place without any counts as having hit nothing
-_FEWEST = 3  # beams, fewer of which show no profile
 _DARK = 0.03  # keeps chromaticity finite
 
 
@@ -92,28 +91,22 @@ class Chromaticity(Frame):
         return (pixels / total).reshape(-1)
 
 
-def make(
+def profile(
     angles: Float[np.ndarray, " W"],
-    channels: int,
-    measures_distance: bool,
     extent: Float[Array, ""] | float,
     bearing_error: Float[Array, ""] | float,
-) -> Frame:
-    """The frame for windows of a sensor.
+) -> Profile:
+    """The frame for windows of distances along three rays or more.
 
     Args:
-      angles: of the rays in the middle of its view, in radians.
-      channels: numbers in the reading of one ray.
-      measures_distance: as in `Sensor`.
+      angles: of the rays in the middle of the sensor's view, in radians.
       extent: radius of the circle that holds a PoI, in metres.
       bearing_error: largest error of the window's middle, in radians.
     """
-    if measures_distance and channels == 1 and len(angles) >= _FEWEST:
-        apart = jnp.asarray(angles - angles.mean(), jnp.float32)
-        pitch = jnp.abs(apart[1] - apart[0])
-        ahead = jnp.sin(jnp.maximum(_AHEAD + bearing_error, 1.01 * pitch))
-        return Profile(jnp.sin(apart), jnp.cos(apart), ahead, jnp.float32(extent))
-    return Chromaticity() if channels == 3 else Frame()
+    apart = jnp.asarray(angles - angles.mean(), jnp.float32)
+    pitch = jnp.abs(apart[1] - apart[0])
+    ahead = jnp.sin(jnp.maximum(_AHEAD + bearing_error, 1.01 * pitch))
+    return Profile(jnp.sin(apart), jnp.cos(apart), ahead, jnp.float32(extent))
 
 
 @pytree

@@ -77,11 +77,7 @@ class InPlace(Reader):
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look, see `Fusion.update` and `fuse`; `weight` is not used.
-
-        Raises:
-          ValueError: if there is no such modality; see also `fuse`.
-        """
+        """Belief after one more look, see `Fusion.update` and `fuse`; `weight` is not used."""
         del weight
         checks.require_modality(modality, self.model.modalities)
         number = len(self.model.modalities)
@@ -112,10 +108,6 @@ def fuse(
       belief: `[D]` before the looks.
       seen: `[M]` bool, which modalities have looked before.
       features: for each modality `[D_m]` new features, or None where it has not looked.
-
-    Raises:
-      ValueError: if `features` has another length than `model.modalities`, all are None, or one
-        does not hold probabilities; if the belief is not finite or its width not positive.
     """
     chex.assert_shape(seen, (len(model.modalities),))
     checks.require_belief("belief", belief, model.latent_size)
@@ -198,12 +190,7 @@ class Filter(Reader):
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look, see `Fusion.update`; `seen` is not used.
-
-        Raises:
-          ValueError: if there is no such modality, `features` are not probabilities, the belief is
-            not finite or its width not positive, or the weight is not from 0 to 1.
-        """
+        """Belief after one more look, see `Fusion.update`; `seen` is not used."""
         del seen
         model = self.model
         checks.require_modality(modality, model.modalities)

@@ -62,9 +62,6 @@ def product_of_experts(belief: Belief, posterior: Belief, prior: Belief) -> Beli
 
     Returns:
       Normalised product, with a lower bound on its precision.
-
-    Raises:
-      ValueError: if a belief is not finite, or a standard deviation is not positive.
     """
     for name, each in (("belief", belief), ("posterior", posterior), ("prior", prior)):
         checks.require_belief(name, each, None if each is belief else len(belief.mean))

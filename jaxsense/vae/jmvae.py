@@ -117,10 +117,6 @@ def encode(
 
     Args:
       features: for each modality `[D_m]`, or None where it is missing.
-
-    Raises:
-      ValueError: if `features` has another length than `model.modalities`, all are None, or one is
-        not finite.
     """
     checks.require_one_each("features", features, model.modalities)
     if all(feature is None for feature in features):

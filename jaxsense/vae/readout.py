@@ -45,12 +45,6 @@ class Bayes:
 
         In the detector's training each label was as frequent as the classes that have it, so
         `p(x | class) ~ p(label | x) / p(label)`.
-
-        Args:
-          features: probabilities of the labels.
-
-        Raises:
-          ValueError: if the features are not probabilities.
         """
         chex.assert_rank(features, 1)
         checks.require_probabilities("features", features)
@@ -67,13 +61,7 @@ class Bayes:
     ) -> Float[Array, " C"]:
         """Normalised logarithms of the classes' probabilities after one more look.
 
-        Args:
-          log_posterior: logarithms before the look.
-          features: see `log_likelihoods`.
-          weight: share of the look that is new evidence, see `vae.Novelty`.
-
-        Raises:
-          ValueError: if all classes are excluded or a logarithm is NaN; see also `log_likelihoods`.
+        `weight` is the share of the look that is new evidence, see `vae.Novelty`.
         """
         chex.assert_shape(log_posterior, self.labels.shape[1:])
         # Rejects -inf (all classes excluded) and NaN.
@@ -89,9 +77,6 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
     Args:
       classes: `[C, D]` joint posterior of each class.
       probabilities: `[C]` of sum 1.
-
-    Raises:
-      ValueError: if `probabilities` are not within 0 and 1, or their sum is not 1.
     """
     chex.assert_shape(probabilities, classes.mean.shape[:1])
     checks.require_probabilities("probabilities", probabilities)
@@ -122,12 +107,7 @@ class Readout:
     def class_probabilities(self, belief: Belief, prior: Belief) -> Float[Array, " C"]:
         """`[C]` probabilities, each at least about 1e-6.
 
-        Args:
-          belief: `[D]`.
-          prior: `[D]` belief before any look, in which all classes are equally likely.
-
-        Raises:
-          ValueError: if the belief is not finite, or a standard deviation is not positive.
+        In the `prior`, the belief before any look, all classes are equally likely.
         """
         checks.require_belief("belief", belief, len(prior.mean))
         found = jnp.maximum(self._of_maximum_entropy(belief), _MIN_PROBABILITY)
@@ -185,9 +165,6 @@ def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[
     """Classes whose `[C, D]` mean is within two standard deviations of a `[D]` belief's.
 
     The nearest one always is plausible.
-
-    Raises:
-      ValueError: if an argument is not finite, or a standard deviation is not positive.
     """
     checks.require_belief("belief", belief)
     chex.assert_shape(class_means, (None, *belief.mean.shape))

@@ -1,6 +1,7 @@
 """Disturbances of the sensors: hand-worked cases, and nothing at all while they are off."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,19 @@ KEYS = jax.random.split(jax.random.key(0), NUMBER)
 EXACT = {"range_noise": 0.0, "max_range": 5.0}
 
 
-measure = jax.jit(jax.vmap(sensors.measured_ranges, in_axes=(0, None, None)))
 TENTHS = jnp.arange(10) / 10
+
+
+@jax.jit
+def measure(distance, config):
+    hits = Hit(distance, 0 * distance, (distance, distance))
+    light: Any = None
+    return jax.vmap(lambda key: sensors.lidar(config).read(key, hits, {}, light))(KEYS)
 
 
 def ranges(distance, **settings):
     """`[NUMBER, B]` measurements of the same distances."""
-    return np.asarray(measure(KEYS, np.float32(distance), LidarConfig(**settings)))
+    return np.asarray(measure(np.float32(distance), LidarConfig(**settings)))
 
 
 def test_noise_grows_with_the_distance():

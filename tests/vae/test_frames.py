@@ -65,7 +65,7 @@ def test_scaling_standardises_by_the_training():
 
 
 def test_the_front_is_sought_as_far_as_the_bearing_may_be_wrong():
-    near_only = frames.make(ANGLES, 1, True, EXTENT, 0.0)
+    near_only = frames.profile(ANGLES, EXTENT, 0.0)
     # A pole 2 cm wide at .108 rad, beyond .1 and within .1 and a bearing error of 1 degree.
     window = cylinder(1.0, 0.108, radius=0.01)
     assert np.asarray(PROFILE(window)).max() > 2 * EXTENT  # the pole, with nothing to its sides
