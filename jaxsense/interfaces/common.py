@@ -18,7 +18,7 @@ from jaxsense.dqn import team_mdp
 from jaxsense.dqn.map_mdp import MapMdp
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
-from jaxsense.tasks.task import TeamTask
+from jaxsense.tasks.task import Task, TeamTask
 
 T = TypeVar("T")
 
@@ -146,7 +146,7 @@ class Robots:
         return after, found, seconds
 
 
-def robots_of(mdp: TeamMdp | TeamTask, config: Config | None = None) -> Robots:
+def robots_of(mdp: TeamMdp | Task, config: Config | None = None) -> Robots:
     """Robots of a task; or of the MDP of a team, with the settings that name them."""
     if isinstance(mdp, TeamTask) and config is None:
         carried = tuple(mdp.modalities[m] for m in mdp.robots.tolist())

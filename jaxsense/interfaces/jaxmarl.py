@@ -15,7 +15,7 @@ from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import common
-from jaxsense.tasks.task import TeamTask
+from jaxsense.tasks.task import Task
 
 # Its import prints, and sets `sys.stdout` to `sys.__stdout__`, which is not where notebooks print.
 with (
@@ -48,7 +48,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     the same for all, is the duration of the step. The methods are jaxmarl's.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
         """Makes the environment.
 
         Args:

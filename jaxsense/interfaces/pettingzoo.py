@@ -15,8 +15,7 @@ from jaxsense.core.types import Key
 from jaxsense.dqn.team_mdp import TeamMdp, TeamState
 from jaxsense.interfaces import common
 from jaxsense.interfaces.common import Robots
-from jaxsense.tasks import TimeStep
-from jaxsense.tasks.task import TeamTask
+from jaxsense.tasks import Task, TimeStep
 
 with common.extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
@@ -35,7 +34,7 @@ class TeamAECEnv(AECEnv):
     actions that the robot has.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
         """Makes the environment; `reset` must be called before the first step.
 
         Args:
@@ -138,7 +137,7 @@ class TeamParallelEnv(conversions.turn_based_aec_to_parallel_wrapper):
     alone, and `active_agent` in the infos names it.
     """
 
-    def __init__(self, mdp: TeamMdp | TeamTask, config: Config | None = None):
+    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
         """Makes the environment, see `TeamAECEnv`."""
         super().__init__(TeamAECEnv(mdp, config))
 

@@ -49,7 +49,7 @@ class Graph:
     constants: dict[str, np.ndarray]
     sizes: dict[str, str]
     names: Iterator[str]
-    known: ChainMap[Any, str] = dataclasses.field(default_factory=ChainMap)
+    known: ChainMap[Any, str]
     nodes: list[onnx.NodeProto] = dataclasses.field(default_factory=list)
 
     def constant(self, value: Any) -> str:
@@ -97,7 +97,7 @@ class Graph:
                     return self.sizes[name]
                 case ast.BinOp(left=left, op=op, right=right) if type(op) in _ARITHMETIC:
                     return self.op(_ARITHMETIC[type(op)], read(left), read(right))
-            return _require(False, f"the size {size}")
+            raise NotImplementedError(f"the size {size} has no ONNX translation")
 
         return read(ast.parse(str(size).replace("^", "**"), mode="eval").body)
 
@@ -466,9 +466,8 @@ def program(
     closed, outputs = jax.make_jaxpr(apply, return_shape=True)(models, *inputs.values())
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(outputs))
     given = list(itertools.compress([*weights, *inputs], is_read))
-    graph = Graph(
-        {n: weights[n] for n in given if n in weights}, {}, map("x{}".format, itertools.count())
-    )
+    constants = {name: weights[name] for name in given if name in weights}
+    graph = Graph(constants, {}, map("x{}".format, itertools.count()), ChainMap())
     for key, array in inputs.items():
         for axis, size in enumerate(array.shape):
             if not isinstance(size, int):
@@ -479,7 +478,7 @@ def program(
     ]
     whole = helper.make_graph(
         [*graph.nodes, *named],
-        name.replace("+", "_"),
+        name,
         [_info(*each) for each in inputs.items()],
         [_info(*each) for each in outputs.items()],
         [numpy_helper.from_array(x, key) for key, x in graph.constants.items()],
