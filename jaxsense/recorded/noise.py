@@ -63,12 +63,9 @@ def _scans(angles: np.ndarray, ranges: np.ndarray) -> Float[np.ndarray, "S A"]:
     if len(angles) < _BEAMS:
         raise ValueError(f"number of angles = {len(angles)}: must be at least {_BEAMS}")
     found = resampling.with_returns(ranges)
-    if found.ndim != 2 or found.shape[1] != len(angles):
-        expected = f"must be (S, {len(angles)}), one for each of the angles of each scan"
-        raise ValueError(f"ranges have the shape {found.shape}: {expected}")
-    wrong = found[(found < 0) & np.isfinite(found)]
-    if wrong.size:
-        raise ValueError(f"ranges = {wrong[0]:g}: must be 0 or infinite without a return")
+    checks.require_shape("ranges", found, (None, len(angles)))
+    expected = "must be 0 or infinite without a return"
+    checks.require("ranges", found, lambda x: ~(np.isfinite(x) & (x < 0)), expected)
     return np.where(np.isnan(found), np.float32(np.inf), found)
 
 

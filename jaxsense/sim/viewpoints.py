@@ -212,7 +212,9 @@ def without_poi(
     keeps_others = (stay < 0.5) & ~(kind["wall"] | kind["off"])
     positions = jnp.where(keeps_others, view.positions, away[None])
     positions = positions.at[poi].set(jnp.where(is_there, view.positions[poi], away))
-    half_width = jnp.array([_half_width(sensor) for sensor in sensors])[robot]
+    # At the sensor's height, of a robot that carries the same one.
+    widths = [amiro.LIDAR_HALF_WIDTH if s.is_on_top else amiro.BODY_RADIUS for s in sensors]
+    half_width = jnp.array(widths)[robot]
     least = jnp.maximum(_MIN_DISTANCE / distance, 0.15)
     share = jnp.where(kind["covered"], least + (0.7 - least) * near_by, least + near_by)
     aside = 0.7 * half_width * (2 * beside - 1)
@@ -241,8 +243,3 @@ def _wrong_bearing(
     left = jnp.maximum(ends[1] - view.bearing - apart, 0.0)
     offset = draw * (right + left)
     return jnp.where(offset < right, ends[0] + offset, ends[1] - (offset - right))
-
-
-def _half_width(sensor: Sensor) -> float:
-    """Half the width, at the sensor's height, of a robot that carries the same sensor."""
-    return amiro.LIDAR_HALF_WIDTH if sensor.is_on_top else amiro.BODY_RADIUS

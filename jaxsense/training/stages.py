@@ -5,7 +5,6 @@
 and stops if asked to.
 """
 
-import contextlib
 import functools
 from collections.abc import Mapping
 
@@ -146,10 +145,6 @@ def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
     return found
 
 
-class _EnoughError(Exception):
-    """Ends a training after the stage that was named."""
-
-
 @checks.typed
 def learn(
     key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
@@ -169,18 +164,17 @@ def learn(
     outputs, progress, finite = dict[str, Output](), dict[str, Progress](), [jnp.bool_(True)]
 
     def drive(stage: Stage, **inputs: Output) -> Output:
+        if until in outputs:
+            return None
         outputs[stage.name], steps = scan(key, config, stage, inputs)
         if steps is not None:
             progress[stage.name] = steps
         if not stage.is_optional:
             losses = () if steps is None else steps.loss
             finite.append(is_finite((outputs[stage.name], losses)))
-        if stage.name == until:
-            raise _EnoughError
         return outputs[stage.name]
 
-    with contextlib.suppress(_EnoughError):
-        train(drive, config, arena)
+    train(drive, config, arena)
     return Learned(outputs, progress, jnp.stack(finite).all())
 
 

@@ -176,7 +176,7 @@ FUNCTIONS = {
     ),
     "fit_noise scan": (
         lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), np.ones(20)),
-        "ranges have the shape (20,): must be (S, 20), one for each of the angles of each scan",
+        "ranges has the shape (20,): must be (any, 20)",
     ),
     "retrain nan": (
         lambda w: retrain(w, np.full((8, 61), NAN)),
