@@ -102,9 +102,9 @@ def _play(
     arguments: Arguments, scenario: mission.Mission, models: Models, compiler: Compiler
 ) -> dict[str, Played]:
     """A mission of each policy, in the same arena."""
-    player, key = missions.Player(scenario, compiler, total=1), jax.random.key(arguments.seed)
-    cases = mission.cases(scenario.config, scenario.policies)
     names = dict.fromkeys((arguments.policy, _REFERENCE))
+    scenario, key = scenario.playing(names), jax.random.key(arguments.seed)
+    player, cases = missions.Player(scenario, compiler, total=1), mission.cases(scenario.config)
     return {name: player.play(key, models, {name: cases[name]}, episodes=1) for name in names}
 
 

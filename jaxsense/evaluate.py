@@ -100,6 +100,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         config = _elsewhere(arguments, trained, models.agent.plays)
         scenario = mission.make_mission(config, policies)
         played = _cases(arguments, scenario)
+        scenario = scenario.playing(case.policy for case in played.values())
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)

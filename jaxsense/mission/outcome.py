@@ -42,7 +42,7 @@ _TAKEN = ("all", "policies", "bytes_per_detection")  # by `evaluate` and by the 
 class Case:
     """A condition to play missions in: a policy, and faults of robots."""
 
-    policy: int
+    policy: str
     faults: Faults
 
 
@@ -84,15 +84,14 @@ def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]
     """
     healthy, names = no_faults(config), tuple(policies)
     _require_names(names)
-    found = {name: Case(policy, healthy) for policy, name in enumerate(names)}
-    latent = names.index("latent")
+    found = {name: Case(name, healthy) for name in names}
     for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
         own = jnp.arange(len(config.carried)) == r
         alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
         failing = jnp.where(own, FAULT_TIME, jnp.inf)
-        found[f"{name}_alone"] = Case(latent, alone)
-        found[f"{name}_stops"] = Case(latent, Faults(failing, healthy.blind_at))
-        found[f"{name}_blind"] = Case(latent, Faults(healthy.stops_at, failing))
+        found[f"{name}_alone"] = Case("latent", alone)
+        found[f"{name}_stops"] = Case("latent", Faults(failing, healthy.blind_at))
+        found[f"{name}_blind"] = Case("latent", Faults(healthy.stops_at, failing))
     return found
 
 

@@ -1,7 +1,7 @@
 """The state of missions, and the parts that all missions of a configuration share."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -199,6 +199,12 @@ class Mission:
         if name not in self.policies:
             raise ConfigError("policy", name, f"must be one of {', '.join(self.policies)}")
         return [*self.policies].index(name)
+
+    def playing(self, policies: Iterable[str]) -> "Mission":
+        """The mission with some of its policies: programs hold all that it has."""
+        played = {*policies}
+        left = {name: each for name, each in self.policies.items() if name in played}
+        return dataclasses.replace(self, policies=FrozenDict(left))
 
     @property
     def fields_of_view(self) -> dict[str, float]:

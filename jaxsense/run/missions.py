@@ -170,7 +170,9 @@ class Player:
         config, number, threads = self.mission.config, self._workers.number, self._workers.threads
         total = episodes * len(played)
         case, episode = np.divmod(np.arange(total, dtype=np.int32), episodes)
-        of_cases = [(np.int32(each.policy), each.faults) for each in played.values()]
+        of_cases = [
+            (np.int32(self.mission.policy(each.policy)), each.faults) for each in played.values()
+        ]
         missions = episode, *jax.tree.map(lambda *x: np.stack(x)[case], *of_cases)
         # Missions to record begin in the first slots of the first worker.
         second = [*played].index(_SECOND) if _SECOND in played else 0
@@ -267,7 +269,8 @@ def _whole(chunks: list[Recording]) -> Recording:
 def _with_numbers(mission: Mission, config: Config) -> Mission:
     """The mission with traced settings."""
     arenas = mission.world.arena, mission.free_arena
-    return make_mission(config, mission.policies, arenas=arenas)
+    made = make_mission(config, arenas=arenas)
+    return dataclasses.replace(made, policies=mission.policies)
 
 
 def _begin(

@@ -129,6 +129,7 @@ class Programs:
         config = self.config
         with self._compiler.monitor.stopwatch.measure("compile_s", "mission"):
             scenario = mission.make_mission(config, self._policies)
+            scenario = scenario.playing(config.mission.policies)
         number = len(config.mission.policies) * config.mission.episodes
         player = missions.Player(scenario, self._compiler, number, self._workers)
         self.player.set_result(player)

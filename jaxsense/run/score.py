@@ -110,6 +110,7 @@ def score_missions(
         scenario = make_mission(config, own)
         known = cases(config, scenario.policies)
         played = {name: known[name] for name in dict.fromkeys((*policies, *against))}
+        scenario = scenario.playing(played)
         total = episodes * len(played)
         is_cpu = jax.default_backend() == "cpu"
         workers = Workers(threads=devices.threads()) if is_cpu else ALONE

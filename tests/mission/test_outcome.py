@@ -103,6 +103,8 @@ def test_cases_are_the_policies_and_every_failure_of_every_robot():
         "camera_alone", "camera_stops", "camera_blind",
         "lidar_alone", "lidar_stops", "lidar_blind",
     ]  # fmt: skip
+    assert all(cases[name].policy == name for name in POLICIES)
+    assert all(cases[name].policy == "latent" for name in cases if name not in POLICIES)
     np.testing.assert_array_equal(cases["camera_alone"].faults.stops_at, [np.inf, 0.0])
     np.testing.assert_array_equal(cases["lidar_stops"].faults.stops_at, [np.inf, 6.0])
     np.testing.assert_array_equal(cases["lidar_blind"].faults.blind_at, [np.inf, 6.0])
