@@ -7,15 +7,13 @@ import ast
 import dataclasses
 import functools
 import re
-import types
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Literal, get_args, get_origin, get_type_hints
 
 import jaxsense
 from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.config.options import docs
-from jaxsense.config.section import Limits, Section
+from jaxsense.config.section import Section, described, fields_of
 from jaxsense.summary import BLOCKS
 
 DOCS = Path(__file__).parent
@@ -46,16 +44,14 @@ def _sections(name: str, section: Section) -> Iterator[tuple[str, Section]]:
 
 
 def _table_of_section(name: str, section: Section) -> str:
-    kinds, marks = get_type_hints(type(section)), type(section)._LEAVES
     rows = []
-    for field in dataclasses.fields(section):
-        value = getattr(section, field.name)
+    for field, kind, limits in fields_of(type(section)):
+        value = getattr(section, field)
         if not isinstance(value, Section):
-            mark = " †" if field.name in marks else ""
-            allowed = _allowed(kinds[field.name], field.metadata.get("limits"))
-            about = docs(type(section))[field.name]
-            full = f"{name}.{field.name}".lstrip(".")
-            rows.append((f"`{full}`{mark}", _value(value), allowed, about))
+            mark = " †" if field in section.LEAVES else ""
+            full = f"{name}.{field}".lstrip(".")
+            about = docs(type(section))[field]
+            rows.append((f"`{full}`{mark}", _value(value), described(kind, limits), about))
     return _table(("setting", "default", "allowed", "meaning"), rows)
 
 
@@ -90,47 +86,6 @@ def _value(value: object) -> str:
         case _:
             text = "" if value is None else str(value)
     return text or "none"
-
-
-_ONE_AND_MANY = {
-    int: ("a whole number", "whole numbers"),
-    float: ("a number", "numbers"),
-    bool: ("on or off", "on or off"),
-    str: ("a name", "names"),
-}
-
-
-def _allowed(kind: object, limits: Limits | None) -> str:
-    """Type and limits of a setting."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return " or ".join(f"`{each}`" for each in inner)
-    if origin is types.UnionType:
-        given, none = inner
-        assert none is types.NoneType
-        return f"{_allowed(given, limits)}; or none"
-    if origin is tuple:
-        each = _ONE_AND_MANY[inner[0]][1]
-        words = each if ... in inner else f"{len(inner)} {each}"
-        if limits is not None and limits.min_items is not None:
-            most = "or more" if limits.max_items is None else f"to {limits.max_items}"
-            words = f"{limits.min_items} {most} {each}"
-        return f"{words}{_range(limits)}"
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        values = getattr(inner[1], "__name__", None)
-        words = f"`{values}`" if dataclasses.is_dataclass(inner[1]) else _allowed(inner[1], limits)
-        return f"for each name, {words}"
-    assert isinstance(kind, type)
-    return f"{_ONE_AND_MANY[kind][0]}{_range(limits)}"
-
-
-def _range(limits: Limits | None) -> str:
-    """Limits of numbers, after what they limit."""
-    if limits is None:
-        return ""
-    words = dataclasses.replace(limits, min_items=None, max_items=None).expected(0)
-    words = words.removeprefix("must be").rstrip()
-    return f",{words}" if words.startswith(" at least") else words
 
 
 def _text(section: object) -> str:

@@ -1,6 +1,5 @@
 """`jaxsense demo`: plays a mission with trained robots and opens a page with its animations."""
 
-import dataclasses
 import os
 import sys
 import webbrowser
@@ -12,13 +11,14 @@ import rich.console
 from jaxsense import mission, summary
 from jaxsense.config import ConfigError
 from jaxsense.config.options import command
-from jaxsense.config.section import check_fields, require
+from jaxsense.config.section import Checked, limited
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.missions import Played
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
+from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import film, page, tables
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.tasks import PRETRAINED, load_pretrained
@@ -28,8 +28,7 @@ _REFERENCE = "naive"
 _AVERAGES = "What learning is worth"  # section of the README
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Plays a mission with trained robots and again with naive exploration, and shows both."""
 
     preset: str = "default"
@@ -37,7 +36,7 @@ class Arguments:
     policy: str = "latent"
     """Policy to compare with naive exploration: `latent` (the learned policy), `network`, `greedy`,
     `bayes`, `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
-    seed: int = 2
+    seed: int = limited(2, at_least=0, at_most=MAX_SEED)
     """Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,
     robots can skip looks; in those of 0 and 1, they cannot."""
     out: Path | None = None
@@ -47,9 +46,8 @@ class Arguments:
     cache: Path | None = cli.CACHE
     """Directory in which to cache compiled programs; `none` for no cache."""
 
-    def __post_init__(self):
-        check_fields(self, bits=64)
-        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
+    def check(self) -> None:
+        """Checks the directory of compiled programs; raises `ConfigError`."""
         cli.require_directory("cache", self.cache)
 
 

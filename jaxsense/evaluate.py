@@ -17,13 +17,14 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD, MAX_EPISODES
 from jaxsense.config.options import Name
 from jaxsense.config.scene import TIMESTEP
-from jaxsense.config.section import check_fields, limited, require
+from jaxsense.config.section import Checked, limited
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
+from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import drawing, film, page, plots, tables
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import compare
@@ -33,22 +34,16 @@ from jaxsense.summary.read import EVALUATIONS
 PROGRAM = "jaxsense.evaluate"
 
 
-@dataclasses.dataclass(frozen=True)
-class ArenaArguments:
+class ArenaArguments(Checked, place="arena"):
     """An arena that may differ from the run's."""
 
-    PLACE = "arena"
     num_pois: int | None = None
     """Number of points of interest; the run's by default."""
     side: float | None = None
     """Side of the arena, in metres; the run's by default."""
 
-    def __post_init__(self):
-        check_fields(self)
 
-
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Plays missions with the policies of a finished run, and compares them in the same arenas."""
 
     run: Annotated[Path, Name("RUN")]
@@ -56,7 +51,7 @@ class Arguments:
     newest one in `runs/`."""
     episodes: int = limited(256, at_least=1, at_most=MAX_EPISODES)
     """Number of missions per policy."""
-    seed: int = 0
+    seed: int = limited(0, at_least=0, at_most=MAX_SEED)
     """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
     """What to play: `latent`, `network`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
@@ -78,9 +73,8 @@ class Arguments:
     trust: bool = False
     """Trust the run's `config.json`: run the code of custom sensors that it names."""
 
-    def __post_init__(self):
-        check_fields(self, bits=64)
-        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
+    def check(self) -> None:
+        """Checks the directory of compiled programs; raises `ConfigError`."""
         cli.require_directory("cache", self.cache)
 
 

@@ -6,7 +6,6 @@ nor jaxsense: `interfaces/robot.py` plays the functions, and `recorded/resamplin
 scans of other sensors into those that `detect` reads.
 """
 
-import dataclasses
 import io
 import json
 import math
@@ -25,7 +24,7 @@ from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import Search
 from jaxsense.config.options import Name
 from jaxsense.config.scene import MAX_BEARING
-from jaxsense.config.section import check_fields
+from jaxsense.config.section import Checked
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team_mdp import Team, Travel
@@ -302,8 +301,7 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
     }
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Writes detectors, encoders and policies of a run into one file for robots without JAX."""
 
     run: Annotated[Path, Name("RUN")]
@@ -314,9 +312,6 @@ class Arguments:
     `PRESET.zip` in the current directory."""
     trust: bool = False
     """Trust the run's `config.json`: run the code of custom sensors that it names."""
-
-    def __post_init__(self):
-        check_fields(self)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -1,6 +1,5 @@
 """`jaxsense tasks`: the frozen tasks, and what known policies reach in them."""
 
-import dataclasses
 import sys
 
 import numpy as np
@@ -8,6 +7,7 @@ import rich.console
 
 from jaxsense import tasks
 from jaxsense.config import ConfigError
+from jaxsense.config.section import Checked
 from jaxsense.run import cli, devices, output
 from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
@@ -22,8 +22,7 @@ SCOREBOARD = "docs/tasks.md"
 """The page with the scores of policies."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Lists the frozen tasks of `jaxsense.make`, and the returns of policies to compare with."""
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, NoReturn, cast
+from typing import Annotated, NoReturn
 
 import jax
 import numpy as np
@@ -21,8 +21,7 @@ import rich.table
 from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import Name, OptionError, command, read_some
-from jaxsense.config.section import check_fields, limited, require
-from jaxsense.config.whole import PresetName
+from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
 from jaxsense.run.devices import MAX_DEVICES
@@ -48,21 +47,14 @@ _COMMON = (
 """Options that `--help` shows."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Trains detectors, the JMVAE and one Q-network per modality, and writes a run directory."""
 
-    config: Annotated[Config, Name("--")]
-    preset: PresetName = "default"
-    """Settings to start from; the other options change them."""
-    seed: int = 0
-    """Seed of all randomness, from 0 to 2^32 - 1."""
+    settings: Annotated[Settings, Name("--")] = Settings()
+    """The settings that determine the results."""
     out: Path | None = None
     """Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`."""
-    num_seeds: int = limited(1, at_least=1, at_most=10_000)
-    """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
-    which reports their means and 95 % confidence intervals."""
-    file: Annotated[Path | None, Name("--config")] = None
+    config: Path | None = None
     """The `config.json` of a run whose preset, seed and settings the new run starts from."""
     resume: Path | None = None
     """Directory of a stopped run to continue, with its own settings."""
@@ -86,19 +78,9 @@ class Arguments:
     cache: Path | None = cli.CACHE
     """Directory in which to cache compiled programs; `none` for no cache."""
 
-    def __post_init__(self):
-        if isinstance(self.file, str):
-            raise ConfigError("config", self.file, "must be a path of printable characters")
-        check_fields(self, bits=64)
-        require(0 <= self.seed < 2**32, self, "seed", "must be from 0 to 2^32 - 1")
-        is_in = self.seed + self.num_seeds <= 2**32
-        require(is_in, self, "num_seeds", "leads beyond seed 2^32 - 1")
+    def check(self) -> None:
+        """Checks the directory of compiled programs; raises `ConfigError`."""
         cli.require_directory("cache", self.cache)
-
-    @property
-    def settings(self) -> Settings:
-        """The settings that determine the results."""
-        return Settings(self.preset, self.seed, self.config, self.num_seeds)
 
 
 def main(
@@ -144,7 +126,7 @@ def main(
     # A quiet run prints only these two lines.
     first = next(path for path in run.seeds.values() if (path / "report.html").exists())
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
-    trust = " --trust" if arguments.config.named_code else ""
+    trust = " --trust" if arguments.settings.config.named_code else ""
     say(f"Next: {command('jaxsense.evaluate')} {shlex.quote(str(first))} --animate{trust}")
 
 
@@ -162,25 +144,19 @@ def parse(
     """
     try:
         stored = _stored(argv, change)
-        default = Arguments(
-            config=stored.config,
-            preset=cast(PresetName, stored.preset),
-            seed=stored.seed,
-            num_seeds=stored.num_seeds,
-        )
-        arguments = cli.parse(PROGRAM, Arguments, argv, default, _COMMON)
-        require_playable(arguments.config, policies)
+        arguments = cli.parse(PROGRAM, Arguments, argv, Arguments(stored), _COMMON)
+        require_playable(arguments.settings.config, policies)
         if arguments.tensorboard:
             terminal.require_tensorboard()
-        if arguments.file is not None and arguments.preset != stored.preset:
-            raise ConfigError("config", str(arguments.file), "has a preset; omit --preset")
+        if arguments.config is not None and arguments.settings.preset != stored.preset:
+            raise ConfigError("config", str(arguments.config), "has a preset; omit --preset")
         if arguments.resume is not None:
-            has_place = arguments.out is not None or arguments.file is not None
-            if has_place or arguments.settings != stored:
-                which = (
-                    "directory; omit --out and --config" if has_place else "settings; omit others"
-                )
-                raise ConfigError("resume", str(arguments.resume), f"resumes in its own {which}")
+            resume, is_elsewhere = str(arguments.resume), arguments.out or arguments.config
+            if is_elsewhere:
+                reason = "resumes in its own directory; omit --out and --config"
+                raise ConfigError("resume", resume, reason)
+            if arguments.settings != stored:
+                raise ConfigError("resume", resume, "resumes in its own settings; omit others")
     except (ConfigError, OptionError) as error:
         cli.fail(PROGRAM, str(error))
     return arguments
@@ -188,13 +164,13 @@ def parse(
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, needed before those are read."""
-    given = read_some(Arguments, argv, ("resume", "file", "trust", "preset"))
-    is_trusted = given.get("trust") is True
-    if isinstance(resume := given.get("resume"), Path):
+    given = read_some(Arguments, argv, ("--resume", "--config", "--trust", "--preset"))
+    is_trusted = given.get("--trust") is True
+    if isinstance(resume := given.get("--resume"), Path):
         return resumable(resume, is_trusted)
-    if isinstance(file := given.get("file"), Path):
+    if isinstance(file := given.get("--config"), Path):
         return read_settings(file, is_trusted)
-    preset = str(given.get("preset", "default"))
+    preset = str(given.get("--preset", "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     return Settings(preset, 0, change(PRESETS[preset]))

@@ -178,7 +178,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     [
         (["--preset", "paper"], "preset = 'paper': must be one of default, noisy"),
         (["--policy", "best"], "policy = 'best': must be one of latent"),
-        (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
+        (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
         (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
         (["--out", "full/file"], "out = 'full/file': cannot be written"),
         (["--cache", "full/file"], "cache = 'full/file': must be a directory"),

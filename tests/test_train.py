@@ -148,8 +148,8 @@ def test_every_kind_of_option_is_read(tmp_path):
         --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
         --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
     arguments = train.parse(words.split())
-    config, smoke = arguments.config, PRESETS["smoke"]
-    assert (arguments.seed, arguments.cache, arguments.devices) == (4, None, None)
+    config, smoke = arguments.settings.config, PRESETS["smoke"]
+    assert (arguments.settings.seed, arguments.cache, arguments.devices) == (4, None, None)
     assert arguments.quiet is False
     assert (config.arena.side, config.arena.num_pois) == (4.0, 4)
     assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
@@ -166,8 +166,9 @@ def test_every_kind_of_option_is_read(tmp_path):
         file = str(tmp_path / "run" / "config.json")
         again = train.parse(["--config", file, "--robots", "None", "--arena.side", "5"])
         resumed = train.parse(["--resume", str(tmp_path / "run")])
-    assert (again.seed, again.preset, again.config.robots) == (7, "smoke", None)
-    assert again.config.arena == dataclasses.replace(config.arena, side=5.0)
+    given = again.settings
+    assert (given.seed, given.preset, given.config.robots) == (7, "smoke", None)
+    assert given.config.arena == dataclasses.replace(config.arena, side=5.0)
     assert resumed.settings == Settings("smoke", 7, config)
 
 

@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import (
     Annotated,
-    Any,
     ClassVar,
     Literal,
     NoReturn,
@@ -41,7 +40,6 @@ Traced = Annotated[T, _LEAF]
 """A setting that only enters the arithmetic: a number, or a JAX array, traced or not."""
 
 _MAX_SHOWN = 200  # characters of a value
-_SMALLEST, _LARGEST = 1e-30, 1e30  # a product of two still fits float32
 
 
 class ConfigError(ValueError):
@@ -51,10 +49,20 @@ class ConfigError(ValueError):
         text = f"{field} = {_shown(value)}: {expected}"
         # It may quote a file, whose control characters a terminal would obey.
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
-        self.expected = expected
 
     def __reduce__(self):
-        return type(self).__new__, (type(self), *self.args), self.__dict__
+        return type(self).__new__, (type(self), *self.args)
+
+
+def _shown(value: object) -> str:
+    """A value in one short line; a function by its name."""
+    if callable(value):
+        return getattr(value, "__name__", type(value).__name__)
+    try:
+        text = " ".join(line.strip() for line in repr(value).splitlines())
+    except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits
+        return f"a huge {type(value).__name__}"
+    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 class FrozenDict(dict[K, V]):
@@ -81,23 +89,6 @@ class FrozenDict(dict[K, V]):
     setdefault = update = _refuse  # pyright: ignore[reportAssignmentType]
 
 
-class _Unknown:
-    """A traced number: what it is compared with is right, what is computed from it unknown."""
-
-    def _unknown(self, *_: object) -> "_Unknown":
-        return self
-
-    __lt__ = __le__ = __gt__ = __ge__ = _unknown
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _unknown
-    __truediv__ = __rtruediv__ = __mod__ = __neg__ = __abs__ = __round__ = _unknown
-
-    def __format__(self, spec: str) -> str:
-        return "a traced number"
-
-
-_UNKNOWN = _Unknown()
-
-
 @dataclasses.dataclass(frozen=True)
 class Limits:
     """Limits of each number in a field, and of its number of items; None where there is none."""
@@ -106,36 +97,41 @@ class Limits:
     at_least: float | None = None
     below: float | None = None
     at_most: float | None = None
-    min_items: int | None = None
+    min_items: int = 0
     max_items: int | None = None
 
-    def expected(self, value: object) -> str:
-        """What would be right for a field with a value."""
+    def __str__(self) -> str:
+        """Limits of a number, such as "from 0 to 1"; empty without any."""
+        if self.at_least is not None and self.at_most is not None:
+            return f"from {self.at_least:,} to {self.at_most:,}"
         words = {
             "greater than": self.above,
             "at least": self.at_least,
             "below": self.below,
             "at most": self.at_most,
         }
-        limits = " and ".join(f"{each} {x:,}" for each, x in words.items() if x is not None)
-        if self.at_least is not None and self.at_most is not None:
-            limits = f"from {self.at_least:,} to {self.at_most:,}"
-        if self.min_items is not None:
-            most = "or more" if self.max_items is None else f"to {self.max_items}"
-            return f"must have {self.min_items} {most} values" + (limits and f", each {limits}")
-        return f"must each be {limits}" if isinstance(value, tuple) else f"must be {limits}"
+        return " and ".join(f"{each} {x:,}" for each, x in words.items() if x is not None)
 
-    def allow(self, value: object) -> bool:
-        """Whether all numbers of a value, and their number, are within the limits."""
-        if isinstance(value, tuple):
-            most = len(value) if self.max_items is None else self.max_items
-            return (self.min_items or 0) <= len(value) <= most and all(map(self.allow, value))
-        return not isinstance(value, int | float) or (
-            (self.above is None or value > self.above)
-            and (self.at_least is None or value >= self.at_least)
-            and (self.below is None or value < self.below)
-            and (self.at_most is None or value <= self.at_most)
+    def allow(self, number: float, *, is_whole: bool) -> bool:
+        """Whether a number is within the limits, and fits 32 bits."""
+        is_large = self.at_most is not None and self.at_most >= 2**31
+        return (
+            (is_large or _fits(number, is_whole=is_whole))
+            and (self.above is None or number > self.above)
+            and (self.at_least is None or number >= self.at_least)
+            and (self.below is None or number < self.below)
+            and (self.at_most is None or number <= self.at_most)
         )
+
+
+_NO_LIMITS = Limits()
+
+
+def _fits(number: float, *, is_whole: bool) -> bool:
+    """Whether 32 bits hold a number, and the product of two that are not whole."""
+    if is_whole:
+        return abs(number) < 2**31
+    return number == 0 or 1e-30 <= abs(number) <= 1e30
 
 
 def limited(default: T, **limits: float) -> T:
@@ -155,35 +151,112 @@ def require(condition: object, section: object, field: str, expected: str) -> No
         raise ConfigError(_place(section, field), getattr(section, field), expected)
 
 
-def check_fields(section: object, bits: int = 31) -> None:
-    """Checks the type and the limits of all fields of a dataclass.
+def _place(section: object, field: str) -> str:
+    """Name of a field, with its section."""
+    return f"{getattr(section, 'PLACE', '')}.{field}".lstrip(".")
+
+
+def check_fields(section: object) -> None:
+    """Checks the type and the limits of all fields of a dataclass, possibly frozen.
 
     Values take their declared form: whole numbers become real where the type is `float`, lists
     become tuples, and dictionaries become immutable.
 
-    Args:
-      section: the dataclass, possibly frozen.
-      bits: all whole numbers are below `2**bits`. Real numbers must be finite and fit 32 bits.
-
     Raises:
       ConfigError: names the first invalid field.
     """
-    for name, kind, limits in _fields(type(section)):
-        value, place = getattr(section, name), _place(section, name)
+    for name, kind, limits in fields_of(type(section)):
+        value = getattr(section, name)
         try:
-            value = _converted(value, kind)
+            object.__setattr__(section, name, _converted(value, kind, limits))
         except TypeError:
-            raise ConfigError(place, value, f"must be {_described(kind)}") from None
-        object.__setattr__(section, name, value)
-        numbers = value if isinstance(value, tuple) else (value,)
-        fits = all(abs(each) < 2**bits for each in numbers if isinstance(each, int))
-        require(fits, section, name, f"must be below 2^{bits}")
-        parts = {place: value}
-        if isinstance(value, FrozenDict):
-            parts = {f"{place}.{n}": x for n, x in value.items()}
-        for each, x in parts.items():
-            if limits is not None and not limits.allow(x):
-                raise ConfigError(each, x, limits.expected(x))
+            expected = f"must be {described(kind, limits)}"
+            if isinstance(value, int | float) and not _fits(value, is_whole=isinstance(value, int)):
+                expected += ", within 32 bits"
+            raise ConfigError(_place(section, name), value, expected) from None
+
+
+@functools.cache
+def fields_of(cls: type) -> list[tuple[str, object, Limits]]:
+    """Name, type and limits of each field of a dataclass."""
+    hints = get_type_hints(cls, include_extras=True)
+    fields = dataclasses.fields(cls)
+    return [(f.name, hints[f.name], f.metadata.get("limits", _NO_LIMITS)) for f in fields]
+
+
+def _converted(value: object, kind: object, limits: Limits, is_leaf: bool = False) -> object:
+    """A value in its declared form; raises `TypeError` if it is of another type or not allowed."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _converted(value, inner[0], limits, _LEAF in inner)
+    if origin in (Union, types.UnionType):
+        for each in inner:
+            with contextlib.suppress(TypeError):
+                return _converted(value, each, limits, is_leaf)
+    elif origin is tuple and isinstance(value, tuple | list):
+        kinds = inner[:1] * len(value) if ... in inner else inner
+        most = len(value) if limits.max_items is None else limits.max_items
+        if len(kinds) == len(value) and limits.min_items <= len(value) <= most:
+            each = zip(value, kinds, strict=True)
+            return tuple(_converted(x, of, limits, is_leaf) for x, of in each)
+    elif origin is Mapping and isinstance(value, Mapping):
+        if all(isinstance(name, str) for name in value):
+            return FrozenDict({n: _converted(x, inner[1], limits) for n, x in value.items()})
+    elif origin is None:
+        return _scalar(value, cast(type, kind), limits, is_leaf)
+    elif origin is Literal and any(value == x and type(value) is type(x) for x in inner):
+        return value
+    raise TypeError
+
+
+def _scalar(value: object, kind: type, limits: Limits, is_leaf: bool) -> object:
+    """A value of a class, as `_converted`."""
+    if is_leaf and isinstance(value, jax.Array | jax.ShapeDtypeStruct):
+        if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.size == 1:
+            _scalar(value.item(), kind, limits, is_leaf=False)
+        return value
+    if kind in (int, float):
+        # A whole number is real, and no truth value is a number.
+        is_right = type(value) is int or (kind is float and isinstance(value, float))
+        if is_right and limits.allow(number := cast(float, value), is_whole=kind is int):
+            return kind(number)
+    elif isinstance(value, kind):
+        return value
+    raise TypeError
+
+
+_ONE_AND_MANY: dict[object, tuple[str, str]] = {
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    bool: ("True or False", "True or False"),
+    str: ("text", "texts"),
+    Path: ("a path of printable characters", "paths of printable characters"),
+    types.NoneType: ("None", "None"),
+}
+
+
+def described(kind: object, limits: Limits = _NO_LIMITS, *, many: bool = False) -> str:
+    """Description of a declared type and its limits, after "must be"."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return described(inner[0], limits)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, inner))}"
+    if origin in (Union, types.UnionType):
+        return " or ".join(described(each, limits) for each in inner)
+    if origin is tuple:
+        number = "" if ... in inner else f"{len(inner)} "
+        if limits.min_items:
+            most = "or more" if limits.max_items is None else f"to {limits.max_items}"
+            number = f"{limits.min_items} {most} "
+        each = described(inner[0], limits, many=True)
+        return f"{'lists' if many else 'a list'} of {number}{each}"
+    if origin is Mapping:
+        return f"a dictionary from names to {described(inner[1], limits, many=True)}"
+    name = getattr(kind, "__name__", str(kind))
+    words = _ONE_AND_MANY.get(kind, (f"of type {name}", f"values of type {name}"))[many]
+    range_ = str(limits) if kind in (int, float) else ""
+    return f"{words}, {'each ' if many else ''}{range_}" if range_ else words
 
 
 @dataclass_transform(frozen_default=True)
@@ -211,49 +284,27 @@ class Checked:
 class Section(Checked):
     """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
 
-    A traced value passes its own checks, and relations with other fields.
+    Relations between fields are not checked while JAX traces one of them.
     """
 
-    _LEAVES: ClassVar[tuple[str, ...]] = ()
+    LEAVES: ClassVar[tuple[str, ...]] = ()
 
     def __init_subclass__(cls, place: str = "") -> None:
         super().__init_subclass__(place)
-        hints = get_type_hints(cls, include_extras=True)
-        names = [field.name for field in dataclasses.fields(cls)]
-        cls._LEAVES = tuple(name for name in names if _is_leaf(hints[name]))
-        register(cls, cls._LEAVES, [name for name in names if name not in cls._LEAVES])
+        fields = {name: kind for name, kind, _ in fields_of(cls)}
+        cls.LEAVES = tuple(name for name, kind in fields.items() if _is_leaf(kind))
+        register(cls, cls.LEAVES, [name for name in fields if name not in cls.LEAVES])
 
     def __post_init__(self):
-        known = _known(self)
-        check_fields(known)
-        known.check()
-        for name, value in vars(self).items():
-            if not any(isinstance(x, jax.Array | jax.ShapeDtypeStruct) for x in _leaves(value)):
-                object.__setattr__(self, name, getattr(known, name))
-
-
-_leaves = jax.tree.leaves
+        check_fields(self)
+        if not any(isinstance(x, Tracer | jax.ShapeDtypeStruct) for x in jax.tree.leaves(self)):
+            self.check()
 
 
 def _is_leaf(kind: object) -> bool:
     """Whether a field holds leaves: it is declared `Traced` or is a section."""
     is_section = isinstance(kind, type) and issubclass(kind, Section)
     return is_section or _LEAF in getattr(kind, "__metadata__", ())
-
-
-def _known(value: Any) -> Any:
-    """A value of the settings, with numbers for scalar arrays and `_UNKNOWN` for traced ones."""
-    if isinstance(value, Section):
-        known = object.__new__(type(value))
-        vars(known).update(
-            {n: _known(x) if n in value._LEAVES else x for n, x in vars(value).items()}
-        )
-        return known
-    if isinstance(value, tuple):
-        return tuple(map(_known, value))
-    if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.size == 1:
-        return value.item()
-    return _UNKNOWN if isinstance(value, jax.Array | jax.ShapeDtypeStruct) else value
 
 
 def require_function(field: str, value: object, number: int, expected: str) -> None:
@@ -298,88 +349,3 @@ def require_32_bits() -> None:
     """Raises a `ConfigError` if JAX computes in 64 bits, which jaxsense does not support."""
     if jax.config.read("jax_enable_x64"):
         raise ConfigError("JAX_ENABLE_X64", True, "must be off, as jaxsense computes in 32 bits")
-
-
-def _place(section: object, field: str) -> str:
-    """Name of a field, with its section."""
-    return f"{getattr(section, 'PLACE', '')}.{field}".lstrip(".")
-
-
-@functools.cache
-def _fields(cls: type) -> list[tuple[str, object, Limits | None]]:
-    """Name, type and limits of each field of a dataclass."""
-    hints = get_type_hints(cls)
-    return [(f.name, hints[f.name], f.metadata.get("limits")) for f in dataclasses.fields(cls)]
-
-
-def _converted(value: object, kind: object) -> object:
-    """A value in its declared form; raises `TypeError` if it is of another type."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin in (Union, types.UnionType):
-        for each in inner:
-            with contextlib.suppress(TypeError):
-                return _converted(value, each)
-    elif origin is tuple and isinstance(value, tuple | list):
-        kinds = inner[:1] * len(value) if ... in inner else inner
-        if len(kinds) == len(value):
-            return tuple(map(_converted, value, kinds))
-    elif origin is Mapping and isinstance(value, Mapping):
-        return FrozenDict({n: _converted(x, inner[1]) for n, x in _texts(value).items()})
-    elif origin is Literal and any(type(value) is type(n) and value == n for n in inner):
-        return value
-    elif kind is float and isinstance(value, int | float) and not isinstance(value, bool):
-        if value == 0 or _SMALLEST <= abs(value) <= _LARGEST:
-            return float(value)
-    elif (value is _UNKNOWN and origin is None) or (
-        isinstance(kind, type) and isinstance(value, kind) and (kind, type(value)) != (int, bool)
-    ):
-        return value
-    raise TypeError
-
-
-def _texts(value: Mapping) -> Mapping:
-    """A dictionary whose keys are text; raises `TypeError` if they are not."""
-    if all(isinstance(name, str) for name in value):
-        return value
-    raise TypeError
-
-
-_SIZES = f"0 or of magnitude {_SMALLEST} to {_LARGEST}"
-_ONE_AND_MANY: dict[object, tuple[str, str]] = {
-    int: ("a whole number", "whole numbers"),
-    float: (f"a number, {_SIZES}", f"numbers, each {_SIZES}"),
-    bool: ("True or False", "True or False"),
-    str: ("text", "texts"),
-    Path: ("a path of printable characters", "paths of printable characters"),
-    types.NoneType: ("None", "None"),
-}
-
-
-def _described(kind: object, *, many: bool = False) -> str:
-    """Description of a declared type, after "must be"."""
-    origin, inner = get_origin(kind), get_args(kind)
-    if origin is Literal:
-        return f"one of {', '.join(map(str, inner))}"
-    if origin in (Union, types.UnionType):
-        return " or ".join(map(_described, inner))
-    if origin is tuple:
-        number = "" if ... in inner else f"{len(inner)} "
-        return f"{'lists' if many else 'a list'} of {number}{_described(inner[0], many=True)}"
-    if origin is Mapping:
-        return f"a dictionary from names to {_described(inner[1], many=True)}"
-    name = getattr(kind, "__name__", str(kind))
-    return _ONE_AND_MANY.get(kind, (f"of type {name}", f"values of type {name}"))[many]
-
-
-def _shown(value: object) -> str:
-    """A value in one short line; a function by its name."""
-    while isinstance(value, functools.partial):
-        value = value.func
-    if callable(value):
-        return getattr(value, "__name__", type(value).__name__)
-    try:
-        text = repr(value)
-    except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits
-        return f"a huge {type(value).__name__}"
-    text = " ".join(line.strip() for line in text.splitlines())
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."

@@ -1,35 +1,42 @@
 """Settings of a run, and the `config.json` in which its directory keeps them."""
 
-import dataclasses
 import hashlib
 import json
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TypeAlias
+from typing import Annotated, TypeAlias
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
-from jaxsense.config.options import parse_json, require_trust
-from jaxsense.config.section import check_fields
+from jaxsense.config.options import Name
+from jaxsense.config.plain import parse_json
+from jaxsense.config.section import Checked, limited, require
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
 
 Json: TypeAlias = dict[str, object]
+MAX_SEED = 2**32 - 1
+"""Largest seed of `jax.random.key`."""
 
 _KNOWN = {"preset", "seed", "num_seeds", "config", "versions", "commit", "began", "digest"}
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
+class Settings(Checked):
     """Everything that determines a run's results, on the same devices and versions."""
 
-    preset: str
-    seed: int
-    config: Config
-    num_seeds: int = 1
+    preset: str = "default"
+    """Settings to start from: `default`, `paper`, `noisy`, `many`, `raw`, `team`, `recorded` or
+    `smoke`; the other options change them."""
+    seed: int = limited(0, at_least=0, at_most=MAX_SEED)
+    """Seed of all randomness, from 0 to 2^32 - 1."""
+    config: Annotated[Config, Name("--")] = Config()
+    num_seeds: int = limited(1, at_least=1, at_most=10_000)
+    """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
+    which reports their means and 95 % confidence intervals."""
 
-    def __post_init__(self):
-        check_fields(self, bits=64)
+    def check(self) -> None:
+        """Checks the last seed; raises `ConfigError`."""
+        require(self.seeds[-1] <= MAX_SEED, self, "num_seeds", "leads beyond seed 2^32 - 1")
 
     @property
     def seeds(self) -> range:
@@ -124,7 +131,7 @@ def _settings_of(content: Json, trust: bool) -> Settings:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     config = from_plain(content.get("config", {}), PRESETS[preset])
     if not trust:
-        require_trust(config)
+        config.require_trust()
     numbers = {name: content[name] for name in ("seed", "num_seeds") if name in content}
     return Settings(**{"preset": preset, "seed": 0, "config": config, **numbers})
 

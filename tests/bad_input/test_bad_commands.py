@@ -78,7 +78,7 @@ def refusal(main, argv, place, capsys) -> str:
 
 TRAIN = [
     (["--seed"], "argument --seed: expected one argument"),
-    (["--seed", "-1"], "seed = -1: must be from 0 to 2^32 - 1"),
+    (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
     (
         ["--preset", ""],
@@ -130,7 +130,11 @@ OTHERS = [
     (evaluate, ["pretrained:noisy"], "run = 'pretrained:noisy': only names models; must be a"),
     (export, ["noisy"], "run = 'noisy': is not a run directory: it has no config.json"),
     (evaluate, ["RUN"], "is not finished: it has no summary.json; continue it with python -m "),
-    (evaluate, ["RUN", "--episodes", "0"], "episodes = 0: must be from 1 to 100,000"),
+    (
+        evaluate,
+        ["RUN", "--episodes", "0"],
+        "episodes = 0: must be a whole number, from 1 to 100,000",
+    ),
     (evaluate, ["RUN", "--policy", "sonar_alone"], "policy = 'sonar_alone': must be one of"),
     (
         evaluate,

@@ -4,12 +4,13 @@ import random
 
 import pytest
 
-from jaxsense import demo, evaluate, export, task_list, train
+from jaxsense import PRESETS, demo, evaluate, export, task_list, train
 from jaxsense.config import options
 from jaxsense.run import cli
+from jaxsense.run.settings import Settings
 
 SEED, LINES = 20261129, 6_000
-DEFAULT = train.Arguments(train.PRESETS["smoke"])
+DEFAULT = train.Arguments(Settings(config=PRESETS["smoke"]))
 PARSE = {"train": (train.parse, DEFAULT)} | {
     module.PROGRAM: (
         lambda argv, module=module: cli.parse(module.PROGRAM, module.Arguments, argv),
