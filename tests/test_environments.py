@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 HERE = f"{sys.version_info.major}.{sys.version_info.minor}"
 SAMPLE = ("tests/core", "tests/vae", "tests/interfaces/test_gymnasium.py")
-LARGE = ("tests/interfaces/test_rejax.py", "tests/interfaces/test_stable_baselines3.py")
+LARGE = ("tests/interfaces/test_parity.py", "tests/interfaces/test_stable_baselines3.py")
 
 
 def find_python(version):

@@ -122,11 +122,3 @@ def test_a_run_whose_sensor_cannot_be_imported_is_named(run, capsys, monkeypatch
         evaluate.main([str(run), "--trust"])
     assert stop.value.code == 2
     assert "sensors.thermal.make = 'new_modality:thermal': must be" in capsys.readouterr().err
-
-
-def test_three_sensors_fit_together(example):
-    # The whole of it is what `python examples/new_modality.py` trains.
-    config = example("new_modality").change(PRESETS["default"])
-    shape = jaxsense.make_jmvae(config)
-    assert shape.modalities == ("camera", "lidar", "thermal")
-    assert shape.feature_sizes == (2, 2, 2)

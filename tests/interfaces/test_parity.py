@@ -12,6 +12,7 @@ import jaxsense
 from jaxsense.tasks.environment import OneAgent
 
 SEED, NUMBER = 3, 6
+WORD = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)
 
 
 @functools.cache
@@ -37,8 +38,7 @@ def splits(word, rows):
 
 
 def of_gymnasium(task, rows):
-    seed = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)
-    keys = splits(seed, rows)
+    keys = splits(WORD, rows)
     envs = module("gymnasium").MapVectorEnv(task, num_envs=rows, autoreset_mode="Disabled")
     observations, infos = envs.reset(seed=SEED)
     action = yield next(keys), observations[0], infos["action_mask"][0]
@@ -48,8 +48,7 @@ def of_gymnasium(task, rows):
 
 
 def of_gymnasium_alone(task):
-    seed = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)
-    keys, env = splits(seed, 1), module("gymnasium").TaskEnv(task)
+    keys, env = splits(WORD, 1), module("gymnasium").TaskEnv(task)
     observation, info = env.reset(seed=SEED)
     action = yield next(keys), observation, info["action_mask"]
     while True:
@@ -60,9 +59,8 @@ def of_gymnasium_alone(task):
 
 def of_stable_baselines3(task):
     module("gymnasium")
-    seed = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)
     envs = module("gymnasium").MapVectorEnv(task, num_envs=1, autoreset_mode="SameStep")
-    keys, env = splits(seed, 1), module("stable_baselines3").MapVecEnv(envs)
+    keys, env = splits(WORD, 1), module("stable_baselines3").MapVecEnv(envs)
     env.seed(SEED)
     observations = env.reset()
     action = yield next(keys), observations[0], env.env_method("action_masks")[0]
@@ -115,13 +113,8 @@ def of_pettingzoo(task):
         while env.terminations[env.agent_selection] and not ended[0]:
             env.step(None)
         turn = env.agent_selection
-        action = yield (
-            next(keys),
-            env.observe(turn),
-            env.infos[turn]["action_mask"],
-            rewards,
-            *ended,
-        )
+        shown = env.observe(turn), env.infos[turn]["action_mask"]
+        action = yield next(keys), *shown, rewards, *ended
 
 
 ADAPTERS = {
@@ -135,8 +128,8 @@ ADAPTERS = {
 }
 OF_TEAMS = "jaxmarl", "pettingzoo"
 FAST = {
-    ("gymnasium vector", "map-v0"), ("gymnax", "map-v0"), ("jaxmarl", "team-v0"),
-    ("pettingzoo", "team-v0"),
+    ("gymnasium vector", "map-v0"), ("gymnax", "map-v0"), ("rejax", "map-v0"),
+    ("jaxmarl", "team-v0"), ("pettingzoo", "team-v0"),
 }  # fmt: skip
 CASES = [
     pytest.param(*case, marks=[] if case in FAST else pytest.mark.slow, id=" ".join(case))

@@ -1,14 +1,11 @@
-"""Stable-Baselines3 learns on the vector environment; `test_parity` has the steps."""
+"""Stable-Baselines3: cuts, attributes and masks; `test_parity` has the steps."""
 
 import numpy as np
 import pytest
 
 pytest.importorskip("stable_baselines3", reason="stable_baselines3: needs the extra jaxsense[sb3]")
 
-import stable_baselines3 as sb3
-import torch
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor
 
 import jaxsense
 from jaxsense.interfaces.gymnasium import make_vec
@@ -18,33 +15,6 @@ from jaxsense.interfaces.stable_baselines3 import MapVecEnv
 @pytest.fixture(scope="module")
 def env():
     return MapVecEnv(make_vec("map-v0", 4, starts=64, autoreset_mode="SameStep"))
-
-
-@pytest.mark.slow
-def test_its_dqn_learns(env):
-    torch.set_num_threads(1)  # faster than two for networks of this size
-    model = sb3.DQN(
-        "MlpPolicy",
-        VecMonitor(env),
-        learning_starts=64,
-        batch_size=64,
-        train_freq=1,
-        gradient_steps=2,
-        learning_rate=5e-3,
-        gamma=0.5,
-        target_update_interval=64,
-        exploration_fraction=0.5,
-        seed=0,
-    )
-    env.seed(1)
-    before, _ = evaluate_policy(model, env, n_eval_episodes=40, warn=False)
-    model.learn(1600)
-    env.seed(1)
-    after, _ = evaluate_policy(model, env, n_eval_episodes=40, warn=False)
-    assert len(model.ep_info_buffer) > 0
-    assert after > max(before, 0.0)
-    ppo = sb3.PPO("MlpPolicy", VecNormalize(env), n_steps=16, batch_size=32, n_epochs=1)
-    assert ppo.learn(128).num_timesteps == 128
 
 
 def test_a_cut_is_told_as_stable_baselines3_has_it(env):
