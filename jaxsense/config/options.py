@@ -177,7 +177,7 @@ def _split(
             rest.append(word)
         elif option.kind is bool:
             if equals:
-                raise OptionError(f"argument {name}: ignored explicit argument {_cut(text)!r}")
+                raise OptionError(f"argument {name}: ignored explicit argument '{_cut(text)}'")
             values[option.path] = name != option.off
         else:
             most = option.words[1] or 1
@@ -206,6 +206,7 @@ def _of_type(kind: object, word: str) -> object:
 
 
 def _cut(word: str) -> str:
+    word = word if word.isprintable() else repr(word)[1:-1]
     return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..."
 
 
@@ -214,7 +215,7 @@ def _unknown(words: list[str], names: list[str]) -> str:
     word = next((word for word in words if word.startswith("-")), words[0])
     name = word.partition("=")[0]
     if not word.startswith("-"):
-        return f"unexpected argument {_cut(word)!r}: options start with --"
+        return f"unexpected argument '{_cut(word)}': options start with --"
     if re.sub(r"^--(no-)?", "", name).replace("-", "_") in FORMER:
         return f"{_cut(name)} is no longer an option"
     near = nearest(name[2:], [each[2:] for each in names if each.startswith("--")])

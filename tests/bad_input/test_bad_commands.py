@@ -102,6 +102,8 @@ TRAIN = [
     (["--team.num-pois", "3"], "argument --team.num-pois: expected 2 arguments"),
     (["--mdp.partly-seen-starts", "maybe"], "unexpected argument 'maybe'"),
     (["--dqn.epoch", "3"], "unknown option --dqn.epoch; did you mean --dqn.epochs?"),
+    (["-=\u202e"], "unknown option -; see"),
+    (["-\u202e"], r"unknown option -\u202e; see"),
     (["smoke"], "unexpected argument 'smoke'"),
 ]
 
