@@ -23,16 +23,19 @@ _WIDTH_OF_FILES = 160
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Measures each stage, and with --peers those who do the same, and prints one table."""
+    """Measures each stage, and with --peers those who do the same, and prints one table.
+
+    Attributes:
+      names: Rows to measure; all by default. A wrong one lists them.
+      peers: Also measure other libraries on the same work, in turn.
+      json: File to write; must be new.
+      quick: Use tiny sizes, to check that everything runs.
+    """
 
     names: Annotated[tuple[str, ...], Name("ROWS")] = ()
-    """Rows to measure; all by default. A wrong one lists them."""
     peers: bool = False
-    """Also measure other libraries on the same work, in turn."""
     json: Path | None = None
-    """File to write; must be new."""
     quick: bool = False
-    """Use tiny sizes, to check that everything runs."""
 
     def __post_init__(self):
         check_fields(self)

@@ -206,16 +206,19 @@ def _cell(values: Sequence[float], digits: int) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Trains JMVAEs on six views of digits, and prints one table."""
+    """Trains JMVAEs on six views of digits, and prints one table.
+
+    Attributes:
+      peers: Also train MultiVae's.
+      seeds: Trainings of each model.
+      steps: Gradient steps of each training.
+      json: File to write; must be new.
+    """
 
     peers: bool = False
-    """Also train MultiVae's."""
     seeds: int = limited(5, at_least=1, at_most=100)
-    """Trainings of each model."""
     steps: int = limited(Budget.steps, at_least=1)
-    """Gradient steps of each training."""
     json: Path | None = None
-    """File to write; must be new."""
 
     def __post_init__(self):
         check_fields(self)

@@ -130,10 +130,13 @@ def table(summaries: Iterable[Summary]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Prints the figures of finished runs, a column for each preset."""
+    """Prints the figures of finished runs, a column for each preset.
+
+    Attributes:
+      runs: Their directories, at least one.
+    """
 
     runs: Annotated[tuple[Path, ...], Name("RUNS")] = ()
-    """Their directories, at least one."""
 
     def __post_init__(self):
         check_fields(self)

@@ -65,20 +65,23 @@ def learners() -> tuple[Learner, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Trains learners in the frozen tasks and prints the fractions of the best that they reach."""
+    """Trains learners in the frozen tasks and prints the fractions of the best that they reach.
+
+    Attributes:
+      learners: Learners to train; all by default.
+      only: Tasks to train in; all by default.
+      seeds: Number of seeds, from 0 on, of each learner in each task.
+      jobs: Number of trainings to run in parallel, each on its own core.
+      json: File to write; must be new.
+      quick: Take as few steps as possible, to check that everything runs.
+    """
 
     learners: Annotated[tuple[str, ...], Name("LEARNERS")] = ()
-    """Learners to train; all by default."""
     only: tuple[str, ...] = ()
-    """Tasks to train in; all by default."""
     seeds: int = limited(10, at_least=1, at_most=10)
-    """Number of seeds, from 0 on, of each learner in each task."""
     jobs: int = limited(2, at_least=1, at_most=1024)
-    """Number of trainings to run in parallel, each on its own core."""
     json: Path | None = None
-    """File to write; must be new."""
     quick: bool = False
-    """Take as few steps as possible, to check that everything runs."""
 
     def __post_init__(self):
         check_fields(self)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import jaxsense
 from jaxsense.config import PRESETS, Config, Shape
-from jaxsense.config.options import docs
+from jaxsense.config.options import about, docs
 from jaxsense.config.section import Section, described, fields_of
 from jaxsense.summary import BLOCKS
 
@@ -24,8 +24,8 @@ def settings() -> str:
     """All settings, a table for each section, and what the presets change."""
     parts = []
     for name, section in _sections("", Config()):
-        title, about = f"`{name}`" if name else "Top level", _sentence_case(_text(section))
-        parts.append(f"## {title}\n\n{about}\n\n{_table_of_section(name, section)}")
+        title, text = f"`{name}`" if name else "Top level", _sentence_case(about(section))
+        parts.append(f"## {title}\n\n{text}\n\n{_table_of_section(name, section)}")
     parts.append("## Presets\n\nWhat each preset changes of `default`:\n")
     for preset, config in PRESETS.items():
         if rows := [*_changes("", PRESETS["default"], config)]:
@@ -50,8 +50,8 @@ def _table_of_section(name: str, section: Section) -> str:
         if not isinstance(value, Section):
             mark = " †" if field in section.LEAVES else ""
             full = f"{name}.{field}".lstrip(".")
-            about = docs(type(section))[field]
-            rows.append((f"`{full}`{mark}", _value(value), described(kind, limits), about))
+            meaning = docs(type(section))[field]
+            rows.append((f"`{full}`{mark}", _value(value), described(kind, limits), meaning))
     return _table(("setting", "default", "allowed", "meaning"), rows)
 
 
@@ -86,11 +86,6 @@ def _value(value: object) -> str:
         case _:
             text = "" if value is None else str(value)
     return text or "none"
-
-
-def _text(section: object) -> str:
-    """A docstring as one line."""
-    return " ".join((type(section).__doc__ or "").split())
 
 
 def _sentence_case(text: str) -> str:

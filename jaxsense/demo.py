@@ -29,22 +29,27 @@ _AVERAGES = "What learning is worth"  # section of the README
 
 
 class Arguments(Checked):
-    """Plays a mission with trained robots and again with naive exploration, and shows both."""
+    """Plays a mission with trained robots and again with naive exploration, and shows both.
+
+    Attributes:
+      preset: Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or
+        `team`.
+      policy: Policy to compare with naive exploration: `latent` (the learned policy), `network`,
+        `greedy`, `bayes`, `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or
+        `rollout`.
+      seed: Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,
+        robots can skip looks; in those of 0 and 1, they cannot.
+      out: Directory for the page, new or empty; by default `runs/DATE-TIME-demo-PRESET`.
+      browser: Open the page in a browser, if there is a display.
+      cache: Directory in which to cache compiled programs; `none` for no cache.
+    """
 
     preset: str = "default"
-    """Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or `team`."""
     policy: str = "latent"
-    """Policy to compare with naive exploration: `latent` (the learned policy), `network`, `greedy`,
-    `bayes`, `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or `rollout`."""
     seed: int = limited(2, at_least=0, at_most=MAX_SEED)
-    """Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,
-    robots can skip looks; in those of 0 and 1, they cannot."""
     out: Path | None = None
-    """Directory for the page, new or empty; by default `runs/DATE-TIME-demo-PRESET`."""
     browser: bool = True
-    """Open the page in a browser, if there is a display."""
     cache: Path | None = cli.CACHE
-    """Directory in which to cache compiled programs; `none` for no cache."""
 
     def check(self) -> None:
         """Checks the directory of compiled programs; raises `ConfigError`."""

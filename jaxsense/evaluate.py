@@ -35,43 +35,49 @@ PROGRAM = "jaxsense.evaluate"
 
 
 class ArenaArguments(Checked, place="arena"):
-    """An arena that may differ from the run's."""
+    """An arena that may differ from the run's.
+
+    Attributes:
+      num_pois: Number of points of interest; the run's by default.
+      side: Side of the arena, in metres; the run's by default.
+    """
 
     num_pois: int | None = None
-    """Number of points of interest; the run's by default."""
     side: float | None = None
-    """Side of the arena, in metres; the run's by default."""
 
 
 class Arguments(Checked):
-    """Plays missions with the policies of a finished run, and compares them in the same arenas."""
+    """Plays missions with the policies of a finished run, and compares them in the same arenas.
+
+    Attributes:
+      run: The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
+        newest one in `runs/`.
+      episodes: Number of missions per policy.
+      seed: Seed of the arenas and of all noise, from 0 to 2^32 - 1.
+      policy: What to play: `latent`, `network`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
+        `naive_3`, `random`, `nearest`, `auction` or `rollout`; `policies` for all of these;
+        `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy
+        in missions where that robot works alone, or stops or goes blind after 6 s; or `all` for
+        everything.
+      robots: Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
+        default.
+      devices: Number of accelerators, or of CPU threads, that share the missions. By default all
+        accelerators, or one thread per core, at most 8.
+      cache: Directory in which to cache compiled programs; `none` for no cache.
+      animate: Also write an animation of the first mission, `mission-POLICY-SEED.svg`.
+      trust: Trust the run's `config.json`: run the code of custom sensors that it names.
+    """
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
-    newest one in `runs/`."""
     episodes: int = limited(256, at_least=1, at_most=MAX_EPISODES)
-    """Number of missions per policy."""
     seed: int = limited(0, at_least=0, at_most=MAX_SEED)
-    """Seed of the arenas and of all noise, from 0 to 2^32 - 1."""
     policy: str = "all"
-    """What to play: `latent`, `network`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
-    `naive_3`, `random`, `nearest`, `auction` or `rollout`; `policies` for all of these;
-    `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy in
-    missions where that robot works alone, or stops or goes blind after 6 s; or `all` for
-    everything."""
     arena: ArenaArguments = ArenaArguments()
     robots: tuple[str, ...] | None = None
-    """Sensors of the robots, one per robot, for example `camera camera lidar`; the run's by
-    default."""
     devices: int | None = limited(None, at_least=1, at_most=MAX_DEVICES)
-    """Number of accelerators, or of CPU threads, that share the missions. By default all
-    accelerators, or one thread per core, at most 8."""
     cache: Path | None = cli.CACHE
-    """Directory in which to cache compiled programs; `none` for no cache."""
     animate: bool = False
-    """Also write an animation of the first mission, `mission-POLICY-SEED.svg`."""
     trust: bool = False
-    """Trust the run's `config.json`: run the code of custom sensors that it names."""
 
     def check(self) -> None:
         """Checks the directory of compiled programs; raises `ConfigError`."""

@@ -302,16 +302,19 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
 
 
 class Arguments(Checked):
-    """Writes detectors, encoders and policies of a run into one file for robots without JAX."""
+    """Writes detectors, encoders and policies of a run into one file for robots without JAX.
+
+    Attributes:
+      run: The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
+        newest one in `runs/`, or `pretrained:PRESET` for models that come with jaxsense.
+      out: File to write, which must not exist yet; by default `exported.zip` in the run's
+        directory, or `PRESET.zip` in the current directory.
+      trust: Trust the run's `config.json`: run the code of custom sensors that it names.
+    """
 
     run: Annotated[Path, Name("RUN")]
-    """The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the
-    newest one in `runs/`, or `pretrained:PRESET` for models that come with jaxsense."""
     out: Path | None = None
-    """File to write, which must not exist yet; by default `exported.zip` in the run's directory, or
-    `PRESET.zip` in the current directory."""
     trust: bool = False
-    """Trust the run's `config.json`: run the code of custom sensors that it names."""
 
 
 def main(argv: list[str] | None = None) -> None:

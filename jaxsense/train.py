@@ -48,35 +48,39 @@ _COMMON = (
 
 
 class Arguments(Checked):
-    """Trains detectors, the JMVAE and one Q-network per modality, and writes a run directory."""
+    """Trains detectors, the JMVAE and one Q-network per modality, and writes a run directory.
+
+    Attributes:
+      settings: The settings that determine the results.
+      out: Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`.
+      config: The `config.json` of a run whose preset, seed and settings the new run starts from.
+      resume: Directory of a stopped run to continue, with its own settings.
+      trust: Trust the `config.json` of `--config` or `--resume`: run the code of custom sensors
+        that it names.
+      quiet: Print only errors, the path of the results and the next command.
+      tensorboard: Also write event files for TensorBoard, to `tensorboard/` in the run.
+      devices: Number of accelerators, or of CPU threads, that share scenes and missions. By default
+        all accelerators, or one thread per core, at most 8.
+      coordinator: `HOST:PORT` of the first of several processes that share scenes and missions.
+        Start all of them with the same options except `--process-index`; the first one writes the
+        run.
+      num_processes: Number of processes that share the run.
+      process_index: Index of this process, from 0.
+      cache: Directory in which to cache compiled programs; `none` for no cache.
+    """
 
     settings: Annotated[Settings, Name("--")] = Settings()
-    """The settings that determine the results."""
     out: Path | None = None
-    """Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`."""
     config: Path | None = None
-    """The `config.json` of a run whose preset, seed and settings the new run starts from."""
     resume: Path | None = None
-    """Directory of a stopped run to continue, with its own settings."""
     trust: bool = False
-    """Trust the `config.json` of `--config` or `--resume`: run the code of custom sensors that it
-    names."""
     quiet: bool = False
-    """Print only errors, the path of the results and the next command."""
     tensorboard: bool = False
-    """Also write event files for TensorBoard, to `tensorboard/` in the run."""
     devices: int | None = limited(None, at_least=1, at_most=MAX_DEVICES)
-    """Number of accelerators, or of CPU threads, that share scenes and missions. By default all
-    accelerators, or one thread per core, at most 8."""
     coordinator: str | None = None
-    """`HOST:PORT` of the first of several processes that share scenes and missions. Start all of
-    them with the same options except `--process-index`; the first one writes the run."""
     num_processes: int | None = None
-    """Number of processes that share the run."""
     process_index: int | None = None
-    """Index of this process, from 0."""
     cache: Path | None = cli.CACHE
-    """Directory in which to cache compiled programs; `none` for no cache."""
 
     def check(self) -> None:
         """Checks the directory of compiled programs; raises `ConfigError`."""

@@ -18,26 +18,30 @@ _MAX_UNITS = 65_536  # of a layer; XLA aborts where a product of sizes overflows
 
 
 class DetectorConfig(Section, place="detector"):
-    """The detectors, which classify scanlines; f_x and f_w in the paper."""
+    """The detectors, which classify scanlines; f_x and f_w in the paper.
+
+    Attributes:
+      hidden: Sizes of the hidden layers; not used if the JMVAE learns from scans.
+      num_scans: Simulated scans to train on, per modality.
+      calibration: Share of these scans that is set aside to calibrate the detector, or the encoder
+        if the JMVAE learns from scans: the temperature of its probabilities is fitted by maximum
+        likelihood.
+      num_held_out: Simulated scans for measuring the accuracy.
+      num_repeats: Scenes in which each sensor looks at a PoI several times, to learn how much of a
+        look is new after others nearby, see `vae.Novelty`. With 0, every look counts in full.
+      steps: Gradient steps.
+      batch: Scans per gradient step.
+      learning_rate: Initial learning rate of Adam; decays to zero along a cosine.
+    """
 
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, at_most=_MAX_UNITS, min_items=1)
-    """Sizes of the hidden layers; not used if the JMVAE learns from scans."""
     num_scans: int = limited(98304, at_least=1)
-    """Simulated scans to train on, per modality."""
     calibration: float = limited(0.0, at_least=0, at_most=0.5)
-    """Share of these scans that is set aside to calibrate the detector, or the encoder if the JMVAE
-    learns from scans: the temperature of its probabilities is fitted by maximum likelihood."""
     num_held_out: int = limited(8192, at_least=1)
-    """Simulated scans for measuring the accuracy."""
     num_repeats: int = limited(0, at_least=0, at_most=1_000_000)
-    """Scenes in which each sensor looks at a PoI several times, to learn how much of a look is new
-    after others nearby, see `vae.Novelty`. With 0, every look counts in full."""
     steps: int = limited(4000, at_least=1)
-    """Gradient steps."""
     batch: int = limited(512, at_least=1)
-    """Scans per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
-    """Initial learning rate of Adam; decays to zero along a cosine."""
 
     def num_training(self, number: int) -> int:
         """How many of a number of scans are left to train on, or of groups of them."""
@@ -45,44 +49,49 @@ class DetectorConfig(Section, place="detector"):
 
 
 class JmvaeConfig(Section, place="jmvae"):
-    """The joint multi-modal VAE."""
+    """The joint multi-modal VAE.
+
+    Attributes:
+      learns_from: Training data of the JMVAE. `scans` needs neither detectors nor labels: looks are
+        grouped by PoI, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`.
+        `jmvae.fusion` must then be `filter`.
+      latent_size: Dimensions of the latent space, D_z.
+      hidden: Sizes of the hidden layers of every encoder and decoder.
+      alpha: Weight of the divergence from the joint posterior to each subset's.
+      beta: Weight of the divergence from the joint posterior to the prior.
+      initial_beta: Initial value of beta. If far above `beta`, latent dimensions come into use one
+        by one.
+      annealing: Share of the training during which beta changes from `initial_beta` to `beta`.
+      reconstruction_weights: Weight of each modality's reconstruction, in the order of
+        `modalities`.
+      fusion: How a look updates a belief. `in_place`, as in the paper, keeps the last look of each
+        sensor. `filter` accumulates looks, see section `filter`.
+      restarts: Number of times to train, from different random parameters. The run keeps the result
+        with the lowest loss among those whose beliefs reproduce class probabilities exactly, or
+        among all if the JMVAE learns from scans.
+      samples_per_class: Detections per class and modality in the training set.
+      steps: Gradient steps.
+      batch: Sets of detections, one of each modality, per gradient step; if the JMVAE learns from
+        scans, PoIs per gradient step.
+      learning_rate: Initial learning rate of Adam; decays to zero along a cosine.
+    """
 
     learns_from: Literal["detections", "scans"] = "detections"
-    """Training data of the JMVAE. `scans` needs neither detectors nor labels: looks are grouped by
-    PoI, and the encoders serve as detectors, see `jaxsense.vae.leave_one_out`. `jmvae.fusion` must
-    then be `filter`."""
     latent_size: int = limited(2, at_least=1, at_most=256)
-    """Dimensions of the latent space, D_z."""
     hidden: tuple[int, ...] = limited((64, 64), at_least=1, at_most=_MAX_UNITS, min_items=1)
-    """Sizes of the hidden layers of every encoder and decoder."""
     alpha: Traced[float] = limited(0.1, at_least=0, at_most=_MAX_WEIGHT)
-    """Weight of the divergence from the joint posterior to each subset's."""
     beta: Traced[float] = limited(0.001, above=0, at_most=_MAX_WEIGHT)
-    """Weight of the divergence from the joint posterior to the prior."""
     initial_beta: Traced[float] = limited(0.7, above=0, at_most=_MAX_WEIGHT)
-    """Initial value of beta. If far above `beta`, latent dimensions come into use one by one."""
     annealing: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Share of the training during which beta changes from `initial_beta` to `beta`."""
     reconstruction_weights: Traced[tuple[float, ...]] = limited(
         (10.0, 10.0), at_least=0, at_most=_MAX_WEIGHT, min_items=1
     )
-    """Weight of each modality's reconstruction, in the order of `modalities`."""
     fusion: Literal["in_place", "filter"] = "in_place"
-    """How a look updates a belief. `in_place`, as in the paper, keeps the last look of each sensor.
-    `filter` accumulates looks, see section `filter`."""
     restarts: int = limited(3, at_least=1, at_most=1000)
-    """Number of times to train, from different random parameters. The run keeps the result with the
-    lowest loss among those whose beliefs reproduce class probabilities exactly, or among all if the
-    JMVAE learns from scans."""
     samples_per_class: int = limited(10000, at_least=1)
-    """Detections per class and modality in the training set."""
     steps: int = limited(3000, at_least=1)
-    """Gradient steps."""
     batch: int = limited(256, at_least=1)
-    """Sets of detections, one of each modality, per gradient step; if the JMVAE learns from scans,
-    PoIs per gradient step."""
     learning_rate: Traced[float] = limited(2e-3, above=0, at_most=1)
-    """Initial learning rate of Adam; decays to zero along a cosine."""
 
     def check(self) -> None:
         """Checks that the fusion fits what is learned; raises `ConfigError`."""
@@ -102,10 +111,13 @@ class JmvaeConfig(Section, place="jmvae"):
 
 
 class FilterConfig(Section, place="filter"):
-    """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`."""
+    """The filter, trained after the JMVAE if `jmvae.fusion` is `filter`.
+
+    Attributes:
+      steps: Gradient steps.
+    """
 
     steps: int = limited(2000, at_least=1)
-    """Gradient steps."""
 
     @property
     def learning_rate(self) -> float:
@@ -114,21 +126,25 @@ class FilterConfig(Section, place="filter"):
 
 
 class MdpConfig(Section, place="mdp"):
-    """The map MDP, a Markov decision process whose states are maps of beliefs."""
+    """The map MDP, a Markov decision process whose states are maps of beliefs.
+
+    Attributes:
+      reward: Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
+        `nats`: the information gained about the class, minus `look_cost`.
+        `package.module:function`: the `dqn.Reward` that this function makes from an `MdpConfig`.
+      look_cost: Cost of a look, in nats; only with the reward `nats`.
+      min_increase: Threshold of the reward `paper`: a look that gains no more information than
+        this, in inverse latent units, is rewarded with -1.
+      max_steps: Maximum length of an episode, in actions.
+      partly_seen_starts: Whether to exclude starts where every modality has seen every PoI, or none
+        has seen any.
+    """
 
     reward: str = "paper"
-    """Reward of a look. `paper`: the gain of 1 / ||sigma||, or -1, see `min_increase`.
-    `nats`: the information gained about the class, minus `look_cost`. `package.module:function`:
-    the `dqn.Reward` that this function makes from an `MdpConfig`."""
     look_cost: Traced[float] = limited(0.05, at_least=0, at_most=_MAX_WEIGHT)
-    """Cost of a look, in nats; only with the reward `nats`."""
     min_increase: Traced[float] = limited(0.05, at_least=0)
-    """Threshold of the reward `paper`: a look that gains no more information than this, in inverse
-    latent units, is rewarded with -1."""
     max_steps: Traced[int] = limited(20, at_least=1, at_most=10_000)
-    """Maximum length of an episode, in actions."""
     partly_seen_starts: bool = False
-    """Whether to exclude starts where every modality has seen every PoI, or none has seen any."""
 
     def check(self) -> None:
         """Checks that `reward` is known or can be the name of a function; raises `ConfigError`."""
@@ -137,20 +153,26 @@ class MdpConfig(Section, place="mdp"):
 
 
 class TravelConfig(Section, place="team.travel"):
-    """The travel model, see `dqn.Travel`."""
+    """The travel model, see `dqn.Travel`.
+
+    Attributes:
+      view_distance: Distance from which a robot looks at a PoI, in metres.
+    """
 
     view_distance: Traced[float] = limited(0.96, at_least=0)
-    """Distance from which a robot looks at a PoI, in metres."""
 
 
 class ToursConfig(Section, place="team.tours"):
-    """Training of the network that orders a team's visits, see `jaxsense.dqn.tours`."""
+    """Training of the network that orders a team's visits, see `jaxsense.dqn.tours`.
+
+    Attributes:
+      states: Number of states in which choices are tried, rounded up to whole chunks.
+      steps: Gradient steps. With 0, no order is learned, and an auction orders the looks that pay,
+        as with `dqn.task` = `map`.
+    """
 
     states: int = limited(65536, at_least=1)
-    """Number of states in which choices are tried, rounded up to whole chunks."""
     steps: int = limited(3200, at_least=0)
-    """Gradient steps. With 0, no order is learned, and an auction orders the looks that pay, as
-    with `dqn.task` = `map`."""
 
     @property
     def learning_rate(self) -> float:
@@ -159,18 +181,21 @@ class ToursConfig(Section, place="team.tours"):
 
 
 class TeamConfig(Section, place="team"):
-    """The MDP of a team (`dqn.task` = team), in which robots have positions and looks take time."""
+    """The MDP of a team (`dqn.task` = team), in which robots have positions and looks take time.
+
+    Attributes:
+      travel: Model of the time that a robot takes to look at a PoI.
+      tours: Training of the network that orders a team's visits.
+      num_pois: Minimum and maximum number of PoIs in an episode.
+      sides: Shortest and longest side of an episode's arena, in metres.
+      second_cost: Cost of each second in which a robot works, in units of the reward.
+    """
 
     travel: TravelConfig = TravelConfig()
-    """Model of the time that a robot takes to look at a PoI."""
     tours: ToursConfig = ToursConfig()
-    """Training of the network that orders a team's visits."""
     num_pois: tuple[int, int] = limited((3, 8), at_least=1, at_most=64)
-    """Minimum and maximum number of PoIs in an episode."""
     sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
-    """Shortest and longest side of an episode's arena, in metres."""
     second_cost: Traced[float] = limited(0.0, at_least=0)
-    """Cost of each second in which a robot works, in units of the reward."""
 
     def check(self) -> None:
         """Checks that each minimum is at most its maximum; raises `ConfigError`."""
@@ -184,37 +209,40 @@ class TeamConfig(Section, place="team"):
 
 
 class DqnConfig(Section, place="dqn"):
-    """Deep Q-learning, with one network for each modality or for a team."""
+    """Deep Q-learning, with one network for each modality or for a team.
+
+    Attributes:
+      task: MDP to learn. `map`: a single agent looks at `arena.num_pois` PoIs, and looks take no
+        time, as in the paper; each modality has a dense network. `team`: robots share the map, see
+        section `team`; one network serves any number of PoIs and robots.
+      observe: Source of looks. `live` casts a scan in the environment's own arena at every step;
+        `bank` draws stored detections, which is faster.
+      hidden: Sizes of the hidden layers.
+      num_envs: Number of environments that step in parallel.
+      epochs: Number of epochs, each of one step per environment and `dqn.updates` gradient steps.
+      updates: Gradient steps per epoch.
+      batch: Transitions per gradient step.
+      replay_capacity: Capacity of the replay memory, in transitions; a multiple of `num_envs`.
+      discount: Discount factor, gamma: per step, or per second with `dqn.task` = `team`.
+      learning_rate: Initial learning rate of Adam; decays to a hundredth along a cosine.
+      epsilon_min: Minimum probability of a random action, epsilon, which starts at 1.
+      epsilon_decay: Factor on epsilon per epoch.
+      target_period: Epochs between updates of the target network.
+    """
 
     task: Literal["map", "team"] = "map"
-    """MDP to learn. `map`: a single agent looks at `arena.num_pois` PoIs, and looks take no time,
-    as in the paper; each modality has a dense network. `team`: robots share the map, see section
-    `team`; one network serves any number of PoIs and robots."""
     observe: Literal["live", "bank"] = "live"
-    """Source of looks. `live` casts a scan in the environment's own arena at every step; `bank`
-    draws stored detections, which is faster."""
     hidden: tuple[int, ...] = limited((24, 24), at_least=1, at_most=_MAX_UNITS, min_items=1)
-    """Sizes of the hidden layers."""
     num_envs: int = limited(512, at_least=1)
-    """Number of environments that step in parallel."""
     epochs: int = limited(200, at_least=1)
-    """Number of epochs, each of one step per environment and `dqn.updates` gradient steps."""
     updates: int = limited(64, at_least=1)
-    """Gradient steps per epoch."""
     batch: int = limited(512, at_least=1)
-    """Transitions per gradient step."""
     replay_capacity: int = limited(512000, at_least=1)
-    """Capacity of the replay memory, in transitions; a multiple of `num_envs`."""
     discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
-    """Discount factor, gamma: per step, or per second with `dqn.task` = `team`."""
     learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
-    """Initial learning rate of Adam; decays to a hundredth along a cosine."""
     epsilon_min: Traced[float] = limited(0.01, at_least=0, at_most=1)
-    """Minimum probability of a random action, epsilon, which starts at 1."""
     epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
-    """Factor on epsilon per epoch."""
     target_period: Traced[int] = limited(50, at_least=1)
-    """Epochs between updates of the target network."""
 
     def check(self) -> None:
         """Checks that chunks are long and all environments fill the replay together."""
@@ -244,23 +272,27 @@ class DqnConfig(Section, place="dqn"):
 
 
 class EvaluationConfig(Section, place="evaluation"):
-    """Evaluation of the trained policies."""
+    """Evaluation of the trained policies.
+
+    Attributes:
+      num_starts: Number of start states of the episodes.
+      num_repeats: Episodes per start state, to average over the noise of detections; an eighth as
+        many for all policies but the learned and the optimal one.
+      num_histories: Random sequences of looks at a PoI, after which the map is compared with exact
+        Bayes.
+      num_pois: Further numbers of PoIs for which a team's policy is compared with the optimum of
+        the map MDP.
+      num_states: Maximum number of map states in which policies are compared; if there are more, a
+        stratified sample of them.
+      value_looks: Sample looks per class that approximate the distribution of looks.
+    """
 
     num_starts: int = limited(512, at_least=1)
-    """Number of start states of the episodes."""
     num_repeats: Traced[int] = limited(96, at_least=1)
-    """Episodes per start state, to average over the noise of detections; an eighth as many for all
-    policies but the learned and the optimal one."""
     num_histories: int = limited(8190, at_least=1, at_most=10_000_000)
-    """Random sequences of looks at a PoI, after which the map is compared with exact Bayes."""
     num_pois: tuple[int, ...] = limited((), at_least=1, at_most=64)
-    """Further numbers of PoIs for which a team's policy is compared with the optimum of the map
-    MDP."""
     num_states: int = limited(4096, at_least=1, at_most=100_000)
-    """Maximum number of map states in which policies are compared; if there are more, a stratified
-    sample of them."""
     value_looks: int = limited(32, at_least=1, at_most=10_000)
-    """Sample looks per class that approximate the distribution of looks."""
 
     @property
     def value_points(self) -> int:

@@ -20,19 +20,25 @@ MARGIN = PLANNING_RADIUS - ROBOT_RADIUS
 
 
 class NavigationConfig(Section, place="navigation"):
-    """Navigation of a robot: the paper's move_base, with the AMiRo's parameters."""
+    """Navigation of a robot: the paper's move_base, with the AMiRo's parameters.
+
+    Attributes:
+      view_range: Maximum distance from which a robot scans a PoI, in metres.
+    """
 
     view_range: Traced[float] = limited(1.0, above=0)
-    """Maximum distance from which a robot scans a PoI, in metres."""
 
 
 class Search(NamedTuple):
-    """Largest errors of a pose for which robots search their scans for a PoI."""
+    """Largest errors of a pose for which robots search their scans for a PoI.
+
+    Attributes:
+      position: In metres.
+      heading: In degrees.
+    """
 
     position: float = 0.0
-    """In metres."""
     heading: float = 0.0
-    """In degrees."""
 
     @property
     def applies(self) -> bool:
@@ -45,20 +51,23 @@ class LocalisationConfig(Section, place="mission.localisation"):
 
     Each setting has two numbers: metres for x and y, and degrees for the heading. Errors are normal
     and independent.
+
+    Attributes:
+      in_training: Whether detectors and policies also learn from looks with the constant errors;
+        they never learn from errors that driving adds.
+      error: Standard deviations of a robot's constant error in a mission, in metres and degrees.
+      drift: Standard deviations of the errors that one metre of driving adds, in metres and
+        degrees; they grow with the square root of the distance.
+      search: Largest errors, in metres and degrees, for which robots search their scans for the
+        PoI, for example three times `error`: the detector judges all windows and distances that
+        they could explain, and a robot keeps at least `viewpoint.min_distance` plus the first
+        number away.
     """
 
     in_training: bool = False
-    """Whether detectors and policies also learn from looks with the constant errors; they never
-    learn from errors that driving adds."""
     error: Traced[tuple[float, float]] = limited((0.0, 0.0), at_least=0, at_most=180)
-    """Standard deviations of a robot's constant error in a mission, in metres and degrees."""
     drift: Traced[tuple[float, float]] = limited((0.0, 0.0), at_least=0, at_most=180)
-    """Standard deviations of the errors that one metre of driving adds, in metres and degrees; they
-    grow with the square root of the distance."""
     search: tuple[float, float] = limited((0.0, 0.0), at_least=0, at_most=30)
-    """Largest errors, in metres and degrees, for which robots search their scans for the PoI, for
-    example three times `error`: the detector judges all windows and distances that they could
-    explain, and a robot keeps at least `viewpoint.min_distance` plus the first number away."""
 
     def check(self) -> None:
         """Checks the limits of the errors of positions; raises `ConfigError`."""
@@ -68,17 +77,20 @@ class LocalisationConfig(Section, place="mission.localisation"):
 
 
 class CommunicationConfig(Section, place="mission.communication"):
-    """Messages between robots about their looks, which may be lost or late."""
+    """Messages between robots about their looks, which may be lost or late.
+
+    Attributes:
+      own_maps: Whether each robot decides from its own map, which its looks and messages from the
+        others update; otherwise all robots share one map. Requires `jmvae.fusion` = `filter`, with
+        which looks add up.
+      loss: Share of messages that are lost; only with `own_maps`.
+      delay: Mean delay of a message, in seconds; each delay is drawn from 0 to twice the mean. Only
+        with `own_maps`.
+    """
 
     own_maps: bool = False
-    """Whether each robot decides from its own map, which its looks and messages from the others
-    update; otherwise all robots share one map. Requires `jmvae.fusion` = `filter`, with which looks
-    add up."""
     loss: Traced[float] = limited(0.0, at_least=0, at_most=0.95)
-    """Share of messages that are lost; only with `own_maps`."""
     delay: Traced[float] = limited(0.0, at_least=0, at_most=3600)
-    """Mean delay of a message, in seconds; each delay is drawn from 0 to twice the mean. Only with
-    `own_maps`."""
 
     def check(self) -> None:
         """Checks that messages are sent if they are lost or late; raises `ConfigError`."""
@@ -88,28 +100,32 @@ class CommunicationConfig(Section, place="mission.communication"):
 
 
 class MissionConfig(Section, place="mission"):
-    """Missions, in which all robots act in closed loop in one arena."""
+    """Missions, in which all robots act in closed loop in one arena.
+
+    Attributes:
+      policies: Policies that play missions at the end of a run: any of `latent`, `network`,
+        `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`,
+        `rollout` and custom policies. `jaxsense.evaluate` plays all of them.
+      episodes: Missions per policy at the end of a run.
+      time_limit: Maximum length of a mission, in seconds.
+      auctions: Whether robots divide the PoIs that are worth a look among themselves by an auction,
+        in which they bid travel times, if their policy prescribes no order. Otherwise, they follow
+        values.
+      equal_values: Tolerance, in units of the reward: actions whose values are this close to the
+        best count as equally good: a robot prefers PoIs that no other heads for, then the nearest.
+      least_confidence: Minimum probability of the most likely label for a scan to update the map.
+      localisation: Localisation errors.
+      communication: Messages between robots about their looks.
+    """
 
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
-    """Policies that play missions at the end of a run: any of `latent`, `network`, `greedy`,
-    `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`, `rollout` and
-    custom policies. `jaxsense.evaluate` plays all of them."""
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
-    """Missions per policy at the end of a run."""
     time_limit: Traced[float] = limited(120.0, at_least=CONTROL_PERIOD, at_most=3600)
-    """Maximum length of a mission, in seconds."""
     auctions: Traced[bool] = True
-    """Whether robots divide the PoIs that are worth a look among themselves by an auction, in which
-    they bid travel times, if their policy prescribes no order. Otherwise, they follow values."""
     equal_values: Traced[float] = limited(0.1, at_least=0)
-    """Tolerance, in units of the reward: actions whose values are this close to the best count as
-    equally good: a robot prefers PoIs that no other heads for, then the nearest."""
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
-    """Minimum probability of the most likely label for a scan to update the map."""
     localisation: LocalisationConfig = LocalisationConfig()
-    """Localisation errors."""
     communication: CommunicationConfig = CommunicationConfig()
-    """Messages between robots about their looks."""
 
     def check(self) -> None:
         """Checks that no policy repeats; raises `ConfigError`."""

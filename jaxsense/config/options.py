@@ -1,11 +1,8 @@
 """Settings as options of a command line: fields of dataclasses, whose docstrings are the help."""
 
-import ast
 import contextlib
 import dataclasses
-import functools
 import inspect
-import itertools
 import math
 import re
 import shlex
@@ -243,13 +240,13 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     options = {option.name: option for option in options_of(base)}
     usage = [f"usage: {command(program)} [OPTIONS]"]
     usage += [_usage(each) for name, each in options.items() if not name.startswith("-")]
-    lines = [" ".join(usage), "", *_filled(base.__doc__, width)]
+    lines = [" ".join(usage), "", *_filled(about(base), width)]
     place = None
     for option in (options[name] for name in common or options):
         inside = "" if common else getattr(option.section, "PLACE", "")
         if inside != place:
             lines += ["", f"{inside or 'options'}:"]
-            lines += [*_filled(option.section.__doc__, width, 2), ""] if inside else []
+            lines += [*_filled(about(option.section), width, 2), ""] if inside else []
         place = inside
         lines += [f"  {option.name} {_metavar(option)}".rstrip(), *_filled(_text(option), width, 6)]
     if common:
@@ -257,10 +254,9 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
     return "\n".join(lines)
 
 
-def _filled(text: str | None, width: int, indent: int = 0) -> list[str]:
-    """A docstring as indented lines."""
-    plain = " ".join((text or "").replace("`", "").split())
-    lines = textwrap.wrap(plain, width - indent, break_on_hyphens=False)
+def _filled(text: str, width: int, indent: int = 0) -> list[str]:
+    """A text as indented lines, without backticks."""
+    lines = textwrap.wrap(text.replace("`", ""), width - indent, break_on_hyphens=False)
     return [" " * indent + line for line in lines]
 
 
@@ -293,13 +289,14 @@ def _text(option: Option) -> str:
     return f"{option.help} (default: {words})"
 
 
-@functools.cache
+def about(section: object) -> str:
+    """Description of a dataclass in its docstring, without that of its fields."""
+    return " ".join((section.__doc__ or "").partition("Attributes:")[0].split())
+
+
 def docs(section: type) -> dict[str, str]:
-    """Docstrings of the fields of a dataclass whose source is available, each as one line."""
-    found: dict[str, str] = {}
-    (node,) = ast.parse(textwrap.dedent(inspect.getsource(section))).body
-    for pair in itertools.pairwise(getattr(node, "body", ())):
-        match pair:
-            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
-                found[name] = " ".join(text.split())
-    return found
+    """Descriptions of the fields of a dataclass in its docstring, each as one line."""
+    _, _, attributes = inspect.cleandoc(section.__doc__ or "").partition("Attributes:\n")
+    _, *parts = re.split(r"^  (\w+): ", attributes, flags=re.MULTILINE)
+    texts = (" ".join(text.split()) for text in parts[1::2])
+    return dict(zip(parts[::2], texts, strict=True))

@@ -43,13 +43,16 @@ MODALITIES: Mapping[str, str] = FrozenDict({"camera": "colour", "lidar": "shape"
 
 
 class Shape(Checked, place="shape"):
-    """A shape of PoIs: an upright cylinder or box, `POI_HEIGHT` high."""
+    """A shape of PoIs: an upright cylinder or box, `POI_HEIGHT` high.
+
+    Attributes:
+      primitive: The solid.
+      half_sides: Half the sides of a box, or the radius of a cylinder twice, as shares of
+        arena.poi_radius from 0.5 to 1.
+    """
 
     primitive: Literal["cylinder", "box"]
-    """The solid."""
     half_sides: tuple[float, float] = limited((1.0, 1.0), at_least=_MIN_SHARE, at_most=1)
-    """Half the sides of a box, or the radius of a cylinder twice, as shares of arena.poi_radius
-    from 0.5 to 1."""
 
     def check(self) -> None:
         """Checks that a cylinder is round; raises `ConfigError`."""
@@ -68,12 +71,15 @@ class Shape(Checked, place="shape"):
 
 
 class Attribute(Checked, place="attribute"):
-    """A numeric property of each PoI besides colour and shape, for example its temperature."""
+    """A numeric property of each PoI besides colour and shape, for example its temperature.
+
+    Attributes:
+      values: Number of each word that a class can have.
+      elsewhere: The number of walls and robots.
+    """
 
     values: Mapping[str, float]
-    """Number of each word that a class can have."""
     elsewhere: float = 0.0
-    """The number of walls and robots."""
 
     def check(self) -> None:
         """Checks the words; raises `ConfigError`."""
@@ -116,25 +122,29 @@ Value = tuple[float, float, float] | Shape | float
 
 
 class ArenaConfig(Section, place="arena"):
-    """The square arena, its points of interest (PoIs) and the classes they are drawn from."""
+    """The square arena, its points of interest (PoIs) and the classes they are drawn from.
+
+    Attributes:
+      side: Inner length and width of the arena, in metres.
+      num_pois: Number of points of interest.
+      poi_radius: Radius of a cylinder and half the side of a cube, in metres; unit of the sides of
+        custom shapes.
+      poi_gap: Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass.
+      classes: Classes of PoIs, all equally likely: `"COLOUR SHAPE"`, and a word per custom
+        attribute.
+      colours: Albedo of each colour, linear RGB in [0, 1].
+      shapes: Geometry of each shape. Rays are tested against every shape at every PoI, used or not.
+      attributes: Attributes besides colour and shape, for custom sensors.
+    """
 
     side: float = limited(3.0, above=0, at_most=100)
-    """Inner length and width of the arena, in metres."""
     num_pois: int = limited(3, at_least=1, at_most=64)
-    """Number of points of interest."""
     poi_radius: float = limited(0.1, above=0)
-    """Radius of a cylinder and half the side of a cube, in metres; unit of the sides of custom
-    shapes."""
     poi_gap: float = limited(0.3, above=0)
-    """Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass."""
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
-    """Classes of PoIs, all equally likely: `"COLOUR SHAPE"`, and a word per custom attribute."""
     colours: Mapping[str, tuple[float, float, float]] = limited(COLOURS, at_least=0, at_most=1)
-    """Albedo of each colour, linear RGB in [0, 1]."""
     shapes: Mapping[str, Shape] = SHAPES
-    """Geometry of each shape. Rays are tested against every shape at every PoI, used or not."""
     attributes: Mapping[str, Attribute] = FrozenDict()
-    """Attributes besides colour and shape, for custom sensors."""
 
     def check(self) -> None:
         """Checks names, classes and room for the PoIs.
@@ -229,29 +239,35 @@ class ArenaConfig(Section, place="arena"):
 
 
 class LidarConfig(Section, place="lidar"):
-    """The AMiRo's LiDAR, a Hokuyo URG-04LX."""
+    """The AMiRo's LiDAR, a Hokuyo URG-04LX.
+
+    Attributes:
+      num_beams: Beams per scan.
+      field_of_view: Angle between the first and the last beam, in degrees.
+      min_range: Shortest measured distance, in metres.
+      max_range: Longest measured distance, in metres; simulated beams without a return read it,
+        too.
+      range_noise: Standard deviation of a measured distance, in metres; `range_noise_growth` adds
+        to it.
+      range_noise_growth: Growth of that standard deviation with the distance, in metres per metre.
+      mixed_pixels: Probability that a beam returns a distance between that of its surface and that
+        of its neighbour's, if both are in range; at an edge, this is a point in empty space.
+      dropout: Probability that a beam has no return.
+      window: Number of beams around the PoI's bearing that the detector reads.
+      window_range: Distance at which the detector's input is clipped, in metres; removes the
+        background.
+    """
 
     num_beams: int = limited(683, at_least=1, at_most=100_000)
-    """Beams per scan."""
     field_of_view: float = limited(240.0, above=0, at_most=360)
-    """Angle between the first and the last beam, in degrees."""
     min_range: Traced[float] = limited(0.08, above=0)
-    """Shortest measured distance, in metres."""
     max_range: Traced[float] = limited(5.0, above=0, at_most=1000)
-    """Longest measured distance, in metres; simulated beams without a return read it, too."""
     range_noise: Traced[float] = limited(0.01, at_least=0)
-    """Standard deviation of a measured distance, in metres; `range_noise_growth` adds to it."""
     range_noise_growth: float = limited(0.0, at_least=0, at_most=1)
-    """Growth of that standard deviation with the distance, in metres per metre."""
     mixed_pixels: float = limited(0.0, at_least=0, at_most=1)
-    """Probability that a beam returns a distance between that of its surface and that of its
-    neighbour's, if both are in range; at an edge, this is a point in empty space."""
     dropout: float = limited(0.0, at_least=0, at_most=1)
-    """Probability that a beam has no return."""
     window: int = limited(128, at_least=1)
-    """Number of beams around the PoI's bearing that the detector reads."""
     window_range: Traced[float] = limited(1.5, above=0)
-    """Distance at which the detector's input is clipped, in metres; removes the background."""
 
     def check(self) -> None:
         """Checks the order of distances, and the window; raises `ConfigError`."""
@@ -263,27 +279,32 @@ class LidarConfig(Section, place="lidar"):
 
 
 class CameraConfig(Section, place="camera"):
-    """The AMiRo's camera, of which one line of pixels is used."""
+    """The AMiRo's camera, of which one line of pixels is used.
+
+    Attributes:
+      num_pixels: Number of pixels of the scanline.
+      field_of_view: Horizontal field of view, in degrees.
+      pixel_noise: Standard deviation of a pixel's value, where 1 is full scale.
+      exposure_error: Standard deviation of the natural logarithm of an image's brightness.
+      colour_cast: Standard deviation of the natural logarithm of each channel's brightness in an
+        image.
+      low_light: Maximum share of the light that may be missing in an image; the share is uniform
+        from 0.
+      shadow: Probability of a shadow: on one side of a random pixel of the image, only ambient
+        light remains. It, exposure, cast and low light drift with time and place, see `sim.light`.
+      window: Number of pixels around the PoI's bearing that the detector reads.
+      stride: Step between the pixels that the detector reads, in pixels.
+    """
 
     num_pixels: int = limited(640, at_least=1, at_most=100_000)
-    """Number of pixels of the scanline."""
     field_of_view: float = limited(80.0, above=0, below=180)
-    """Horizontal field of view, in degrees."""
     pixel_noise: Traced[float] = limited(0.007, at_least=0, at_most=1)
-    """Standard deviation of a pixel's value, where 1 is full scale."""
     exposure_error: float = limited(0.0, at_least=0, at_most=10)
-    """Standard deviation of the natural logarithm of an image's brightness."""
     colour_cast: float = limited(0.0, at_least=0, at_most=10)
-    """Standard deviation of the natural logarithm of each channel's brightness in an image."""
     low_light: float = limited(0.0, at_least=0, at_most=1)
-    """Maximum share of the light that may be missing in an image; the share is uniform from 0."""
     shadow: float = limited(0.0, at_least=0, at_most=1)
-    """Probability of a shadow: on one side of a random pixel of the image, only ambient
-    light remains. It, exposure, cast and low light drift with time and place, see `sim.light`."""
     window: int = limited(80, at_least=1)
-    """Number of pixels around the PoI's bearing that the detector reads."""
     stride: int = limited(4, at_least=1)
-    """Step between the pixels that the detector reads, in pixels."""
 
     def check(self) -> None:
         """Checks the window; raises `ConfigError`."""
@@ -291,14 +312,18 @@ class CameraConfig(Section, place="camera"):
 
 
 class ViewpointConfig(Section, place="viewpoint"):
-    """Viewpoints from which a robot looks at a PoI."""
+    """Viewpoints from which a robot looks at a PoI.
+
+    Attributes:
+      min_distance: Shortest distance from the sensor to the PoI's centre, in metres.
+      max_distance: Longest distance from the sensor to the PoI's centre, in metres.
+      bearing_error: Largest error of the bearing on which the detector's window is centred, in
+        degrees.
+    """
 
     min_distance: Traced[float] = limited(0.3, above=0)
-    """Shortest distance from the sensor to the PoI's centre, in metres."""
     max_distance: Traced[float] = limited(1.2, above=0)
-    """Longest distance from the sensor to the PoI's centre, in metres."""
     bearing_error: Traced[float] = limited(1.0, at_least=0, at_most=10)
-    """Largest error of the bearing on which the detector's window is centred, in degrees."""
 
     def check(self) -> None:
         """Checks the order of distances; raises `ConfigError`."""
@@ -307,13 +332,17 @@ class ViewpointConfig(Section, place="viewpoint"):
 
 
 class SensorConfig(Checked, place="sensor"):
-    """A custom sensor, which a robot carries like the camera or the LiDAR."""
+    """A custom sensor, which a robot carries like the camera or the LiDAR.
+
+    Attributes:
+      make: Function that makes the `sim.Sensor` from a `Config`, as `package.module:function`: a
+        name, so that runs can store it.
+      attribute: Attribute that the sensor distinguishes: `colour`, `shape` or one of
+        `arena.attributes`.
+    """
 
     make: str
-    """Function that makes the `sim.Sensor` from a `Config`, as `package.module:function`: a name,
-    so that runs can store it."""
     attribute: str
-    """Attribute that the sensor distinguishes: `colour`, `shape` or one of `arena.attributes`."""
 
     def check(self) -> None:
         """Checks that `make` can be the name of a function; raises `ConfigError`."""

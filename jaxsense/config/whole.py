@@ -32,17 +32,20 @@ _MAX_ROBOTS = 64
 
 
 class Config(Section):
-    """All settings of a run except its seed."""
+    """All settings of a run except its seed.
+
+    Attributes:
+      modalities: Sensors to train: `camera`, `lidar` and the names of custom `sensors`.
+      robots: Sensors of the robots in missions, one per robot, for example `camera camera lidar`;
+        by default, one robot for each modality.
+      sensors: Custom sensors, by the name of their modality.
+    """
 
     modalities: tuple[str, ...] = limited(
         ("camera", "lidar"), min_items=1, max_items=_MAX_MODALITIES
     )
-    """Sensors to train: `camera`, `lidar` and the names of custom `sensors`."""
     robots: tuple[str, ...] | None = limited(None, min_items=1, max_items=_MAX_ROBOTS)
-    """Sensors of the robots in missions, one per robot, for example `camera camera lidar`; by
-    default, one robot for each modality."""
     sensors: Mapping[str, SensorConfig] = FrozenDict()
-    """Custom sensors, by the name of their modality."""
     arena: ArenaConfig = ArenaConfig()
     lidar: LidarConfig = LidarConfig()
     camera: CameraConfig = CameraConfig()

@@ -22,17 +22,20 @@ _KNOWN = {"preset", "seed", "num_seeds", "config", "versions", "commit", "began"
 
 
 class Settings(Checked):
-    """Everything that determines a run's results, on the same devices and versions."""
+    """Everything that determines a run's results, on the same devices and versions.
+
+    Attributes:
+      preset: Settings to start from: `default`, `paper`, `noisy`, `many`, `raw`, `team`, `recorded`
+        or `smoke`; the other options change them.
+      seed: Seed of all randomness, from 0 to 2^32 - 1.
+      num_seeds: Number of seeds to train, starting from `--seed`. Each has its own directory within
+        the run, which reports their means and 95 % confidence intervals.
+    """
 
     preset: str = "default"
-    """Settings to start from: `default`, `paper`, `noisy`, `many`, `raw`, `team`, `recorded` or
-    `smoke`; the other options change them."""
     seed: int = limited(0, at_least=0, at_most=MAX_SEED)
-    """Seed of all randomness, from 0 to 2^32 - 1."""
     config: Annotated[Config, Name("--")] = Config()
     num_seeds: int = limited(1, at_least=1, at_most=10_000)
-    """Number of seeds to train, starting from `--seed`. Each has its own directory within the run,
-    which reports their means and 95 % confidence intervals."""
 
     def check(self) -> None:
         """Checks the last seed; raises `ConfigError`."""
