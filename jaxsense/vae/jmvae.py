@@ -55,10 +55,9 @@ class Jmvae:
         if not self.modalities or len(encoders) < len(self.subsets):
             expected = "must be one name or more, none twice, and none with a +, which joins names"
             raise ValueError(f"modalities = {self.modalities}: {expected}")
-        if self.max_subset is not None:
-            checks.require_number("max_subset", self.max_subset)
-        for size in (*self.feature_sizes, *self.hidden, self.latent_size):
-            checks.require_number("size of features, latents or a layer", size)
+        for name in ("feature_sizes", "hidden", "latent_size", "max_subset"):
+            for size in jax.tree.leaves(getattr(self, name)):
+                checks.require_number(name, size)
 
     @property
     def subsets(self) -> tuple[tuple[int, ...], ...]:
