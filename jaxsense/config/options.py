@@ -1,4 +1,4 @@
-"""Settings as options of a command line: fields of dataclasses, whose docstrings are the help."""
+"""Settings as options of a command line: fields of dataclasses, whose docstring is the help."""
 
 import contextlib
 import dataclasses
