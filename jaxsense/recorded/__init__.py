@@ -1,6 +1,5 @@
 """Recordings of real sensors: reading them, other rays, comparing them, the noise of a LiDAR."""
 
-from jaxsense.recorded.comparing import Compared as Compared
 from jaxsense.recorded.comparing import compare as compare
 from jaxsense.recorded.noise import fit_noise as fit_noise
 from jaxsense.recorded.reading import RecordedLooks as RecordedLooks

@@ -9,8 +9,8 @@ import pytest
 from tiny import KEY, TINY, stage_of
 
 from jaxsense import training
-from jaxsense.training import Progress, Stage, learn
-from jaxsense.training.stage import scan
+from jaxsense.training import learn
+from jaxsense.training.stage import Progress, Stage, scan
 from jaxsense.training.stages import mission_key
 
 

@@ -54,7 +54,7 @@ def learn_by_stages(key, config, until):
         return outputs[stage.name]
 
     training.stages.train(drive, config, make_world(config).arena)
-    return training.Learned(outputs, {}, jnp.stack(finite).all())
+    return training.stages.Learned(outputs, {}, jnp.stack(finite).all())
 
 
 def stage_of(name, config=TINY):
