@@ -1,6 +1,5 @@
 """All trained networks of a run, as one pytree."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -197,19 +196,17 @@ def make_models(config: Config, **trained: Any) -> Models:
 def make_agent(config: Config) -> Agent:
     """Agent of `config.dqn.task`; a team's reads the reward of a useless look from the settings."""
     dqn, latent_size = config.dqn, config.jmvae.latent_size
-    kinds: dict[str, Callable[[], Agent]] = {
-        "map": lambda: MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden),
-        "team": lambda: TeamAgent(
-            config.team,
-            dqn.discount,
-            rewards.make(config.mdp).of_gain(jnp.float32(0)),
-            latent_size,
-            len(config.modalities),
-            dqn.hidden,
-            config.team.tours.steps > 0,
-        ),
-    }
-    return kinds[dqn.task]()
+    if dqn.task == "map":
+        return MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden)
+    return TeamAgent(
+        config.team,
+        dqn.discount,
+        rewards.make(config.mdp).of_gain(jnp.float32(0)),
+        latent_size,
+        len(config.modalities),
+        dqn.hidden,
+        config.team.tours.steps > 0,
+    )
 
 
 def make_readout(config: Config, classes: Belief) -> Readout:
@@ -294,15 +291,15 @@ def init(key: Key, config: Config) -> Models:
         )
     else:
         params = jmvae.init(jmvae_key, model)
-    fusions: dict[str, Callable[[], Fusion]] = {
-        "in_place": lambda: make_in_place(config, params, classes),
-        "filter": lambda: fusion.init_filter(filter_key, model, classes, make_prior(config)),
-    }
+    if config.jmvae.fusion == "filter":
+        fused = fusion.init_filter(filter_key, model, classes, make_prior(config))
+    else:
+        fused = make_in_place(config, params, classes)
     return make_models(
         config,
         detectors=untrained,
         jmvae=params,
-        fusion=fusions[config.jmvae.fusion](),
+        fusion=fused,
         novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         q_networks=tuple(agent.init(k) for k in dqn_keys),

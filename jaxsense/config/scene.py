@@ -64,11 +64,6 @@ class Shape(Checked, place="shape"):
         """Whether it is a cylinder."""
         return self.primitive == "cylinder"
 
-    @property
-    def at_any_yaw(self) -> tuple[str | float, ...]:
-        """What sensors can distinguish it by, as a PoI may have any yaw."""
-        return self.primitive, *sorted(self.half_sides)
-
 
 class Attribute(Checked, place="attribute"):
     """A numeric property of each PoI besides colour and shape, for example its temperature.
@@ -181,7 +176,8 @@ class ArenaConfig(Section, place="arena"):
             require(is_known, self, "classes", f'{name!r} must be "{form}" with {kinds}')
         is_once = len(set(self.classes)) == len(self.classes)
         require(is_once, self, "classes", "must name no class twice")
-        shapes = {word: shape.at_any_yaw for word, shape in self.shapes.items()}
+        # A PoI may have any yaw.
+        shapes = {w: (x.primitive, *sorted(x.half_sides)) for w, x in self.shapes.items()}
         for name, values in {**self._words, "shape": shapes}.items():
             of_values: dict[object, str] = {}
             for word in self.labels(name):
