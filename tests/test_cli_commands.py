@@ -18,7 +18,7 @@ from jaxsense import __main__ as commands
 from jaxsense import demo, export, mission, task_list, tasks
 from jaxsense.run import output
 from jaxsense.run.missions import Played
-from jaxsense.tasks.registry import about, agents
+from jaxsense.tasks.registry import TASKS, agents
 from jaxsense.tasks.score import estimate
 
 ROOT = Path(__file__).parents[1]
@@ -63,7 +63,7 @@ def test_tasks_are_listed_with_the_returns_of_their_files(capsys):
     task_list.main([])
     text = capsys.readouterr().out
     for name in tasks.registered():
-        assert f"{name}: {about(name)}." in text
+        assert f"{name}: {TASKS[name]}." in text
         for agent in agents(name):
             task = jaxsense.make(name, agent)
             assert task.agent == agent
