@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
 
-from jaxsense import summary
 from jaxsense.config import ConfigError
 from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli
-from jaxsense.summary import Results, Summary
+from jaxsense.summary.blocks import Results, Summary, cases
+from jaxsense.summary.read import read_summary
 
 PROGRAM = "benchmarks.presets"
 TABLE_ONE = {
@@ -100,8 +100,8 @@ def _of_missions(policy: str) -> Iterator[Figure]:
     ):
 
         def read(results: Results, key: str = key) -> list[Value]:
-            cases = summary.cases(results["mission"])
-            return [cases[policy][key]] if policy in cases else []
+            of_run = cases(results["mission"])
+            return [of_run[policy][key]] if policy in of_run else []
 
         yield Figure(f"`{policy}`: {label}", form, read)
 
@@ -117,7 +117,7 @@ def table(summaries: Iterable[Summary]) -> str:
         of_seeds = found["seeds"].values() if "seeds" in found else [found]
         presets.setdefault(found["preset"], []).extend(of_seeds)
     seeds = [seed for group in presets.values() for seed in group]
-    policies = dict.fromkeys(name for seed in seeds for name in summary.cases(seed["mission"]))
+    policies = dict.fromkeys(name for seed in seeds for name in cases(seed["mission"]))
     figures = [*LEARNED, *(figure for policy in policies for figure in _of_missions(policy))]
     heads = [
         f"`{preset}`, {len(group)} seed{'s' * (len(group) > 1)}"
@@ -147,7 +147,7 @@ def main(argv: list[str] | None = None) -> None:
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     try:
         require(bool(arguments.runs), arguments, "runs", "must be at least one directory")
-        print(table(map(summary.read, arguments.runs)))
+        print(table(map(read_summary, arguments.runs)))
     except (ConfigError, OSError) as error:
         cli.fail(PROGRAM, str(error))
 

@@ -14,7 +14,7 @@ import jaxsense
 from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.config.options import about, docs
 from jaxsense.config.section import Section, described, fields_of
-from jaxsense.summary import BLOCKS
+from jaxsense.summary.blocks import BLOCKS
 
 DOCS = Path(__file__).parent
 SOURCE = Path(jaxsense.__file__).parent

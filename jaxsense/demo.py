@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import rich.console
 
-from jaxsense import mission, summary
+from jaxsense import mission
 from jaxsense.config import ConfigError
 from jaxsense.config.options import command
 from jaxsense.config.section import Checked, limited
@@ -21,6 +21,7 @@ from jaxsense.run.output import say
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import film, page, tables
 from jaxsense.show.terminal import Display, as_text
+from jaxsense.summary import make
 from jaxsense.tasks import PRETRAINED, load_pretrained
 
 PROGRAM = "jaxsense.demo"
@@ -75,7 +76,7 @@ def main(argv: list[str] | None = None) -> None:
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
                 played = _play(arguments, scenario, models, compiler)
             metrics = {name: each.metrics[name] for name, each in played.items()}
-            block = summary.missions(scenario, metrics)
+            block = make.missions(scenario, metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"
             text = page.fill(

@@ -12,7 +12,7 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import mission, summary
+from jaxsense import mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD, MAX_EPISODES
 from jaxsense.config.options import Name
@@ -27,9 +27,9 @@ from jaxsense.run.programs import OwnPolicies
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import drawing, film, page, plots, tables
 from jaxsense.show.terminal import Display, as_text
-from jaxsense.summary import compare
+from jaxsense.summary import blocks, compare, make
 from jaxsense.summary.blocks import policies as policies_of
-from jaxsense.summary.read import EVALUATIONS
+from jaxsense.summary.read import EVALUATIONS, read_evaluations, read_summary
 
 PROGRAM = "jaxsense.evaluate"
 
@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
             key = jax.random.key(arguments.seed)
             found = player.play(key, models, played, arguments.episodes)
             times.append(time.perf_counter())
-        block = summary.missions(scenario, found.metrics)
+        block = make.missions(scenario, found.metrics)
         fields = scenario.fields_of_view
 
         def draw(title: str) -> str:
@@ -142,11 +142,11 @@ def _write(
     arguments: Arguments,
     trained: Config,
     config: Config,
-    missions: summary.Missions,
+    missions: blocks.Missions,
     draw: Callable[[str], str],
 ) -> list[str]:
     """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
-    run, cases, written = arguments.run, summary.cases(missions), []
+    run, cases, written = arguments.run, blocks.cases(missions), []
     if arguments.animate:
         name, elsewhere = next(iter(cases)), f"-{_place(config)}"
         title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
@@ -160,11 +160,11 @@ def _write(
     stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
     with files.locked(run, on_wait=say):
         # Another policy may have played in the same arenas before; by other code, it stands apart.
-        others = summary.read_evaluations(run)
+        others = read_evaluations(run)
         names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
         name = next(name for name in names if name not in others or _is_alike(others[name]))
-        blocks = {**(others[name]["mission"] if name in others else {}), **missions}
-        found = _evaluation(config, compare.compared(blocks), rundir.origin())
+        merged = {**(others[name]["mission"] if name in others else {}), **missions}
+        found = _evaluation(config, compare.compared(merged), rundir.origin())
         path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
@@ -177,7 +177,7 @@ def _write(
 
 def _report(run: Path, config: Config) -> Path:
     """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
-    own, found, path = summary.read(run), summary.read_evaluations(run), run / "report.html"
+    own, found, path = read_summary(run), read_evaluations(run), run / "report.html"
     if own.get("seeds"):
         raise ConfigError("run", str(run), "holds several seeds; choose one")
     made = [_evaluation(config, own["mission"], own), *found.values()]
@@ -189,8 +189,8 @@ def _report(run: Path, config: Config) -> Path:
 
 
 def _evaluation(
-    config: Config, missions: summary.Missions, origin: summary.Origin
-) -> summary.Evaluation:
+    config: Config, missions: blocks.Missions, origin: blocks.Origin
+) -> blocks.Evaluation:
     """Missions with their arena, their team and what made them."""
     arena = config.arena
     return {
@@ -202,7 +202,7 @@ def _evaluation(
     }
 
 
-def _is_alike(found: summary.Evaluation) -> bool:
+def _is_alike(found: blocks.Evaluation) -> bool:
     """Whether missions were made as this process makes them, be it on another day."""
     return not compare.differences_of([found.get("origin", compare.UNKNOWN), rundir.origin()])
 
@@ -247,13 +247,13 @@ def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission
     return {arguments.policy: cases[arguments.policy]}
 
 
-def _print(console: rich.console.Console, missions: summary.Missions, episodes: int) -> None:
+def _print(console: rich.console.Console, missions: blocks.Missions, episodes: int) -> None:
     """Prints the metrics of all cases."""
     caption = f"{episodes} missions of each policy, in the same arenas"
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
             say(as_text(console, table))
-    if verdict := compare.verdict(summary.cases(missions)):
+    if verdict := compare.verdict(blocks.cases(missions)):
         say(verdict)
     say(compare.detection_sizes(missions))
 

@@ -18,7 +18,6 @@ import numpy as np
 import rich.console
 import rich.table
 
-from jaxsense import summary
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import Name, OptionError, command, read_some
 from jaxsense.config.section import Checked, limited
@@ -32,9 +31,9 @@ from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import tables, terminal
 from jaxsense.show.terminal import Display, as_text
-from jaxsense.summary import compare
+from jaxsense.summary import blocks, compare
 from jaxsense.summary.blocks import Header, Made
-from jaxsense.summary.read import read_made
+from jaxsense.summary.read import read_made, read_summary
 
 PROGRAM = "jaxsense.train"
 
@@ -270,7 +269,7 @@ def _train_one(
 
 def _results(
     run: RunDirectory, programs: Programs, monitor: Monitor
-) -> tuple[summary.Results, dict[str, bytes | str]]:
+) -> tuple[blocks.Results, dict[str, bytes | str]]:
     """Trains one seed and plays its missions; draws both meanwhile."""
     key, config = jax.random.key(run.settings.seed), run.settings.config
     # In one thread of its own, because matplotlib does not work in several at once.
@@ -286,18 +285,18 @@ def _results(
 def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in run.seeds.items() if seed not in failed]
-    timing, of_each, means = compare.of_seeds([summary.read(path) for path in paths])
+    timing, of_each, means = compare.of_seeds([read_summary(path) for path in paths])
     made = [(path.name, each) for path in paths for each in read_made(path)]
     seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
     header = _header(run, [*seeds_made, *run.made("means")])
-    found: summary.Summary = {**header, "timing": timing, "seeds": of_each, **means}
+    found: blocks.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
     curves = rundir.rewards(paths, run.settings.config, _warn)
     _write(run, found, _drawing().of_seeds(curves, means))
 
 
-def _write(run: RunDirectory, found: summary.Summary, pictures: dict[str, bytes | str]) -> None:
+def _write(run: RunDirectory, found: blocks.Summary, pictures: dict[str, bytes | str]) -> None:
     """Writes pictures, page and summary; the last one marks the run as finished."""
     _drawing().write(run.path, run.settings.config, pictures, found)
     rundir.write_json(run.path / "summary.json", found)
@@ -325,7 +324,7 @@ def _header(run: RunDirectory, made: list[Made]) -> Header:
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     """Prints the main metrics; of several seeds, mean and 95% interval."""
-    found, settings = summary.read(run.path), run.settings
+    found, settings = read_summary(run.path), run.settings
     which = f"seed {settings.seed}"
     if settings.num_seeds > 1:
         which = f"seeds {settings.seed} to {settings.seeds[-1]}: mean, 95% interval"
@@ -333,7 +332,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
         say(as_text(console, table))
-    if verdict := compare.verdict(summary.cases(found["mission"])):
+    if verdict := compare.verdict(blocks.cases(found["mission"])):
         say(verdict)
     for remark in compare.remarks(found):
         say(remark)

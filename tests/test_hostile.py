@@ -17,11 +17,12 @@ from smoke import save_models
 from summaries import CASE, EVALUATION, RESULTS, SUMMARY
 
 import jaxsense
-from jaxsense import evaluate, models, summary
+from jaxsense import evaluate, models
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.summary import compare
+from jaxsense.summary.read import read_summary
 
 FEWER = SUMMARY["jmvae"] | {"unambiguous": {"joint": [True]}}
 BLOCKS = {name: SUMMARY[name] for name in RESULTS}
@@ -221,7 +222,7 @@ def test_the_directory_itself_is_sound(base, tmp_path, capsys):
     """Nothing is said about what nobody has changed."""
     shutil.copytree(base, tmp_path / "run")
     assert jaxsense.load(tmp_path / "run")[0] == CONFIG
-    assert summary.read(tmp_path / "run") == SUMMARY
+    assert read_summary(tmp_path / "run") == SUMMARY
     evaluate._report(tmp_path / "run", CONFIG)
     resume(tmp_path / "run")
     assert capsys.readouterr().err == ""

@@ -13,9 +13,9 @@ from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
 from summaries import CASE, SUMMARY
 
 import jaxsense
-from jaxsense import mission, summary
+from jaxsense import mission
 from jaxsense.show import drawing, film, page
-from jaxsense.summary import compare
+from jaxsense.summary import blocks, compare
 
 
 @pytest.fixture(scope="module")
@@ -140,9 +140,9 @@ def test_a_film_is_drawn_whole_and_can_be_paused_without_a_script(run):
 
 
 def test_a_page_of_several_seeds_links_to_theirs(tmp_path):
-    blocks = {name: SUMMARY[name] for name in summary.Results.__annotations__}
-    means = compare.statistics([blocks, blocks])
-    content = {**SUMMARY, **means, "seeds": {"3": blocks, "4": blocks}, "failed": {"5": "jmvae"}}
+    of_seed = {name: SUMMARY[name] for name in blocks.Results.__annotations__}
+    means = compare.statistics([of_seed, of_seed])
+    content = {**SUMMARY, **means, "seeds": {"3": of_seed, "4": of_seed}, "failed": {"5": "jmvae"}}
     text = page.render(tmp_path, CONFIG, content)
     assert "smoke preset, 2 seeds" in text
     assert '<a href="seed-4/report.html">4</a>' in text

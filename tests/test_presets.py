@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxsense import summary
+from jaxsense.summary.read import read_evaluations
 
 pytestmark = pytest.mark.slow
 
@@ -135,7 +135,7 @@ def test_live_and_bank_train_equally_good_policies(default, seed, tmp_path, summ
 def test_missions_with_the_default_preset(default, default_run, run_program):
     options = str(default_run), "--episodes", "1024"
     run_program("evaluate", default_run, *options)
-    (evaluation,) = summary.read_evaluations(default_run).values()
+    (evaluation,) = read_evaluations(default_run).values()
     mission = evaluation["mission"]
     latent, naive = mission["latent"], mission["naive"]
     assert latent["accuracy"] >= max(0.99, naive["accuracy"])
@@ -219,7 +219,7 @@ def test_team_preset(tmp_path, summary_of, run_program):
         run_program("evaluate", path, str(path), *large, "--policy", policy)
     four = "--robots", "camera", "camera", "lidar", "lidar", "--policy", "latent"
     run_program("evaluate", path, str(path), *large, *four)
-    evaluations = summary.read_evaluations(path)
+    evaluations = read_evaluations(path)
     of_two, of_four = (
         evaluations[f"16-points-6-m-{robots}-seed-0-128-missions"]["mission"]
         for robots in ("1-camera-1-lidar", "2-camera-2-lidar")

@@ -14,11 +14,13 @@ from smoke import MISSION_KEYS, SMOKE, error_line
 from untrained import untrained
 
 import jaxsense
-from jaxsense import summary, train
+from jaxsense import train
 from jaxsense.config import PRESETS, Config, Shape
 from jaxsense.config.options import docs
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import drawing
+from jaxsense.summary.blocks import cases
+from jaxsense.summary.read import read_summary
 
 
 def test_run_directory_holds_everything(smoke_run):
@@ -35,7 +37,7 @@ def test_run_directory_holds_everything(smoke_run):
 
 
 def test_summary_keeps_its_contract(smoke_run):
-    found = summary.read(smoke_run)  # which checks the type of each value
+    found = read_summary(smoke_run)  # which checks the type of each value
     assert (found["preset"], found["seed"]) == ("smoke", 5)
     assert set(found["detectors"]) == {"camera", "lidar"}
     belief, latent = found["belief"], found["jmvae"]
@@ -57,7 +59,7 @@ def test_summary_keeps_its_contract(smoke_run):
             assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
             assert block["optimal_states"] < 384
     assert set(found["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
-    for name, case in summary.cases(found["mission"]).items():
+    for name, case in cases(found["mission"]).items():
         assert set(case) == MISSION_KEYS | ({"intervals"} if name != "latent" else set())
         assert case["episodes"] == sum(case["ended"].values()) == 4
         assert case["collisions"] == 0
@@ -107,7 +109,7 @@ def test_a_run_with_a_filter_trains_plays_and_is_loaded(tmp_path, cache):
     path = tmp_path / "run"
     options = "--jmvae.fusion", "filter", "--mdp.reward", "nats", "--mission.episodes", "16"
     train.main([*SMOKE, *cache, *options, "--out", str(path)])
-    found = summary.read(path)
+    found = read_summary(path)
     # The filter is hardly trained, but adds up what the looks show.
     assert found["belief"]["accuracy"][-1] > found["belief"]["accuracy"][0] + 0.1
     # The Q-networks have learned too little to say when to stop; naive exploration sees everything.

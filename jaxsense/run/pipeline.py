@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxsense import mission, summary
+from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
@@ -22,7 +22,7 @@ from jaxsense.run.compilation import Compiler, Kept
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import OwnPolicies, Programs
-from jaxsense.summary import compare
+from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
 from jaxsense.training.comparison import permutations
@@ -68,7 +68,7 @@ class Learned:
     reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
-    results: summary.Learned
+    results: blocks.Learned
 
 
 @contextlib.contextmanager
@@ -104,7 +104,7 @@ def learn(
     scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
     detections = jax.tree.map(np.asarray, trained.outputs["detections"])
-    beliefs = summary.beliefs(trained.outputs["beliefs"])
+    beliefs = make.beliefs(trained.outputs["beliefs"])
     is_sound = compare.unsound(beliefs) is None
     # Measured of a JMVAE that learns from scans, and of no other.
     grouped = {name: x for name, x in trained.outputs.items() if name == "grouped"}
@@ -127,7 +127,7 @@ def learn(
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": summary.jmvae(vars(latent) | grouped),
+            "jmvae": make.jmvae(vars(latent) | grouped),
             "belief": beliefs,
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
         },
@@ -140,7 +140,7 @@ def play(
     programs: Programs,
     learned: Learned,
     checkpoints: Checkpoints,
-) -> tuple[missions.Played, summary.Missions]:
+) -> tuple[missions.Played, blocks.Missions]:
     """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 
     Raises:
@@ -151,15 +151,15 @@ def play(
     of_run = {name: cases[name] for name in config.mission.policies}
     played = player.play(stages.mission_key(key), learned.models, of_run, episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
-    return played, summary.missions(player.mission, played.metrics)
+    return played, make.missions(player.mission, played.metrics)
 
 
-def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> summary.Agent:
+def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> blocks.Agent:
     """One modality's block of `dqn`."""
     rewards = jax.tree.map(np.asarray, trained.outputs[f"policies_{modality}"])
     others = jax.tree.map(np.asarray, trained.outputs.get(f"numbers_{modality}", []))
     fusion, values = trained.outputs["fusion"], trained.outputs["look_values"]
-    return summary.agent(
+    return make.agent(
         config,
         rewards,
         permutations(config),

@@ -19,8 +19,8 @@ from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Listener, Monitor
-from jaxsense.summary import Case, make
-from jaxsense.summary.blocks import MISSIONS
+from jaxsense.summary import make
+from jaxsense.summary.blocks import MISSIONS, Case
 from jaxsense.summary.compare import REFERENCE, differences
 
 _IS_POLICY = "must be a function (key, models, known) -> values that JAX can trace"

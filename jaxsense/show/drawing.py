@@ -12,7 +12,7 @@ from jaxsense.run import files
 from jaxsense.run.missions import Played
 from jaxsense.run.pipeline import Learned
 from jaxsense.show import film, page, plots
-from jaxsense.summary import Missions, Results, Summary
+from jaxsense.summary.blocks import Missions, Results, Summary
 
 Pictures: TypeAlias = dict[str, bytes | str]
 """The content of plots and films, by the names of their files."""

@@ -17,8 +17,8 @@ from jaxsense.config import PRESETS, Config, as_plain
 from jaxsense.config.options import command
 from jaxsense.core import inside
 from jaxsense.show import tables
-from jaxsense.summary import Evaluation, Missions, Summary, cases, compare
-from jaxsense.summary.blocks import mean
+from jaxsense.summary import compare
+from jaxsense.summary.blocks import Evaluation, Missions, Summary, cases, mean
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from jaxsense.config import ConfigError
 from jaxsense.mission.outcome import is_fault
-from jaxsense.summary import Case, Missions, Results, cases
 from jaxsense.summary.blocks import (
     AGENTS,
     BELIEF,
@@ -13,9 +12,13 @@ from jaxsense.summary.blocks import (
     JMVAE,
     MISSIONS,
     STAGES,
+    Case,
     Metric,
+    Missions,
     Number,
+    Results,
     Timing,
+    cases,
     mean,
     policies,
     text,

@@ -21,7 +21,7 @@ EVALUATIONS = "evaluations"
 _MOST_CASES, _LARGEST = 1000, 1e30
 
 
-def read(run: Path) -> Summary:
+def read_summary(run: Path) -> Summary:
     """The summary of a finished run, of one seed or of several.
 
     Raises:

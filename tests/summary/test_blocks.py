@@ -5,7 +5,8 @@ import json
 import pytest
 from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
 
-from jaxsense.summary import BLOCKS, blocks
+from jaxsense.summary import blocks
+from jaxsense.summary.blocks import BLOCKS
 
 KEYS = {place + key for place, block in BLOCKS.items() for key in block}
 # Only in some runs: of several seeds, of a team, from scans, or of one robot alone.

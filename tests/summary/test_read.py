@@ -6,8 +6,8 @@ import json
 import pytest
 from summaries import SUMMARY
 
-from jaxsense import summary
 from jaxsense.config import ConfigError
+from jaxsense.summary.read import read_summary
 
 
 def written(path, content, name="summary.json"):
@@ -18,7 +18,7 @@ def written(path, content, name="summary.json"):
 
 def test_a_summary_is_read_with_keys_of_later_versions(tmp_path):
     content = {**SUMMARY, "later": 1}
-    assert summary.read(written(tmp_path, content)) == content
+    assert read_summary(written(tmp_path, content)) == content
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_what_is_missing_or_wrong_is_named(tmp_path, place, value, reason):
     if value is not None:
         block[key] = value
     with pytest.raises(ConfigError) as error:
-        summary.read(written(tmp_path, content))
+        read_summary(written(tmp_path, content))
     assert "must hold the summary.json of a finished run" in str(error.value)
     assert reason in str(error.value)
     assert "\n" not in str(error.value)
