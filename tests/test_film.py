@@ -65,15 +65,9 @@ def tracks(element):
     return found
 
 
-def texts(picture, start=""):
-    return {t.text: t for t in picture.iter(f"{SVG}text") if (t.text or "").startswith(start)}
-
-
 def beliefs(picture):
-    """The ellipses of the PoIs, and the ring of all that are unknown."""
-    found = [*picture.iter(f"{SVG}ellipse")]
-    (ring,) = (e for e in found if e.get("fill") == "none")
-    return [e for e in found if e is not ring], ring
+    """The ellipses of the PoIs."""
+    return [*picture.iter(f"{SVG}ellipse")]
 
 
 def frames(element, attribute, number=60):
@@ -145,7 +139,7 @@ def test_robots_and_beliefs_are_where_they_were(picture):
     # It turned by 0.08 rad the short way, not once around.
     turns = [np.ptp(t.values) for t in tracks(picture) if t.attribute == "rotate"]
     np.testing.assert_allclose(turns, np.degrees(0.083), atol=0.1)
-    ellipses, _ = beliefs(picture)
+    ellipses = beliefs(picture)
     assert len(ellipses) == 3
     radius = {t.attribute: t for t in tracks(ellipses[1])}["rx"]
     assert radius.at(0.0) > 150
@@ -176,16 +170,11 @@ def test_bars_beside_each_poi_fill_with_the_probabilities_of_its_classes(picture
         np.testing.assert_allclose(heights[:, 50], end, atol=0.02)
 
 
-def test_what_nobody_has_seen_is_listed_as_unknown(picture):
+def test_a_belief_appears_with_the_first_look(picture):
     # PoI 2 is seen in frame 41.
     is_seen = np.zeros((3, 60))
     is_seen[1, 41:] = 1
-    ellipses, ring = beliefs(picture)
-    np.testing.assert_array_equal(frames(ring, "opacity"), 1)
-    np.testing.assert_array_equal([frames(ellipse, "opacity") for ellipse in ellipses], is_seen)
-    lists = texts(picture, "unknown:")
-    assert set(lists) == {"unknown: 1, 2, 3", "unknown: 1, 3"}
-    np.testing.assert_array_equal(frames(lists["unknown: 1, 3"], "opacity"), is_seen[1])
+    np.testing.assert_array_equal([frames(e, "opacity") for e in beliefs(picture)], is_seen)
 
 
 def test_a_field_of_view_is_that_of_the_sensor():

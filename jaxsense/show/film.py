@@ -4,8 +4,6 @@ Its halves are the arena from above and the shared map.
 """
 
 import dataclasses
-import itertools
-import textwrap
 from collections.abc import Mapping
 from importlib import resources
 from xml.etree import ElementTree
@@ -34,17 +32,15 @@ _TIMES = 3  # that it plays
 _PHASES = ("choosing", "driving to", "looking at", "backing off from", "done", "failed")
 _NOTES = (
     "Ellipse: 1-sigma belief about a numbered PoI.",
-    "Identified PoIs are listed at their class.",
-    "Dotted circle: PoIs that no robot has seen.",
+    "It appears with the first look at it.",
+    "Dots: classes, with their names.",
 )
 _STYLE = "\n" + (resources.files("jaxsense.show") / "film.css").read_text(encoding="utf-8")
 _FLASH = 6  # frames that a look is shown for
 _GAP = 4.0  # px, between a PoI and its bars
 _BARS, _BAR, _TALL = 26.0, 6.0, 24.0  # px: most of all bars abreast, most of one, and height
-_CERTAIN = 0.9  # probability of a class from which on a PoI stands at its name
 _ABREAST = 4  # numbers of PoIs at one place
-_LISTED = 16  # characters in a line of a list of PoIs
-_LETTER, _NEXT_LINE = 3.9, 16.0  # px, of a label: half a letter, and from line to line
+_LETTER = 3.9  # px, half a letter of a label
 
 
 @dataclasses.dataclass(frozen=True)
@@ -334,8 +330,6 @@ def _draw_map(parent: Element, scene: _Scene) -> None:
     for colour, (x, y) in zip(scene.colours, place(classes.mean), strict=True):
         add(parent, "circle", cx=x, cy=y, r=3, fill=colour)
     is_seen = np.any(record.seen, axis=-1)
-    is_certain = is_seen & (scene.probabilities.max(axis=-1) >= _CERTAIN)
-    _draw_unknown(parent, scene, place(scene.fusion.prior.mean), radii(scene.fusion.prior.std))
     numbers = add(parent, "g")
     for n in range(scene.config.arena.num_pois):
         colour = scene.colours[int(scene.end.classes[n])]
@@ -349,48 +343,14 @@ def _draw_map(parent: Element, scene: _Scene) -> None:
         number = add(numbers, "g")
         timeline.animate(number, "translate", mean + _beside(n))
         text = add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
-        timeline.animate(text, "opacity", is_seen[:, n] & ~is_certain[:, n], jumps=True)
-    likeliest = scene.probabilities.argmax(axis=-1)
-    for c, (x, y) in enumerate(place(classes.mean)):
+        timeline.animate(text, "opacity", is_seen[:, n], jumps=True)
+    for c, (label, (x, y)) in enumerate(
+        zip(scene.config.arena.classes, place(classes.mean), strict=True)
+    ):
         side = -1 if means[c, 1] >= 0 else 1  # away from the middle
-        at = x, y + side * (scale * stds[c, 1] + 12) + 5
-        _draw_class(parent, scene, c, at, side, is_certain & (likeliest == c))
-
-
-def _draw_unknown(parent: Element, scene: _Scene, place: np.ndarray, radii: np.ndarray) -> None:
-    """Draws one ring for all PoIs that nobody has seen, and their numbers."""
-    is_unseen = ~np.any(scene.record.seen, axis=-1)
-    style = {"fill": "none", "stroke": "#9aa2ad", "stroke_width": 1.5, "stroke_dasharray": "2 5"}
-    (x, y), (rx, ry) = place, radii
-    ring = add(parent, "ellipse", cx=x, cy=y, rx=rx, ry=ry, **style)
-    scene.timeline.animate(ring, "opacity", is_unseen.any(axis=1), jumps=True)
-    texts = [f"unknown: {_listed(of_frame)}" if of_frame.any() else "" for of_frame in is_unseen]
-    style = "film-unknown film-start film-on-floor"
-    scene.timeline.strip(parent, texts, x=8, y=18, class_=style)
-
-
-def _draw_class(
-    parent: Element,
-    scene: _Scene,
-    c: int,
-    at: tuple[float, float],
-    side: int,
-    is_listed: np.ndarray,
-) -> None:
-    """Draws the name of class c and, beyond it, the `[F, N]` PoIs that are certain to be of it."""
-    label = scene.config.arena.classes[c]
-    lists = [textwrap.wrap(_listed(of_frame), _LISTED) for of_frame in is_listed]
-    half = _LETTER * max(map(len, [label, *itertools.chain(*lists)]))
-    style = {"x": np.clip(at[0], half, _SIZE - half), "fill": scene.colours[c]}
-    style["class_"] = "film-label film-on-light"
-    add(parent, "text", label, y=at[1], **style)
-    for i, texts in enumerate(itertools.zip_longest(*lists, fillvalue="")):
-        scene.timeline.strip(parent, [*texts], y=at[1] + side * _NEXT_LINE * (i + 1), **style)
-
-
-def _listed(chosen: np.ndarray) -> str:
-    """The numbers of the chosen `[N]` PoIs."""
-    return ", ".join(str(n + 1) for n in np.flatnonzero(chosen))
+        half = _LETTER * len(label)
+        at = {"x": np.clip(x, half, _SIZE - half), "y": y + side * (scale * stds[c, 1] + 12) + 5}
+        add(parent, "text", label, class_="film-label film-on-light", fill=scene.colours[c], **at)
 
 
 def _beside(n: int) -> np.ndarray:
