@@ -14,7 +14,7 @@ import pytest
 from jaxsense.config import ConfigError
 from jaxsense.core.supervised import FitState
 from jaxsense.run import files
-from jaxsense.run.checkpoints import UNFINISHED, Checkpoints
+from jaxsense.run.files import UNFINISHED, Checkpoints
 
 TREE = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": (np.int32(4), np.array([True]))}
 SHAPES = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, TREE))

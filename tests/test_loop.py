@@ -15,7 +15,7 @@ import pytest
 
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, pipeline, programs
-from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import run_chunks
 from jaxsense.run.programs import Programs

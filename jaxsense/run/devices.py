@@ -7,7 +7,7 @@ import functools
 import math
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from typing import Any, TypeAlias, TypeVar
 
 import jax
@@ -241,13 +241,10 @@ def side_by_side(
     if len(works) == 1:
         return [function(works[0])]
     with ThreadPoolExecutor(threads) as executor:
-        futures = left = [executor.submit(function, each) for each in works]
+        futures = [executor.submit(function, each) for each in works]
         try:
-            while left:
-                # A wait without timeout may not notice Ctrl-C.
-                done, left = wait(left, timeout=0.2)
-                for each in done:
-                    each.result()
+            for each in as_completed(futures):
+                each.result()
         except BaseException as error:
             fail(error)
             raise

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, wait
+from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, as_completed
 
 import jax
 import numpy as np
@@ -17,9 +17,9 @@ from jaxsense.dqn.episodes import has_optimum
 from jaxsense.mission.outcome import require_playable
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
-from jaxsense.run.checkpoints import UNFINISHED, Checkpoints
 from jaxsense.run.compilation import Compiler, Kept
 from jaxsense.run.devices import ALONE, Workers
+from jaxsense.run.files import UNFINISHED, Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.summary import blocks, compare, make
@@ -201,11 +201,8 @@ def train(
         stages.train(drive, config, programs.arena)
         kept = {name: x for name, x in outputs.items() if name not in _ONLY_PASSED_ON}
         outputs.clear()
-        while running:
-            # A wait without timeout may not notice Ctrl-C.
-            done, running = wait(running, timeout=0.2)
-            if done:
-                devices.give_back_freed()
+        for _ in as_completed(running):
+            devices.give_back_freed()
     monitor.check_stop()
     return Trained({name: output.result() for name, output in kept.items()}, training.curves)
 

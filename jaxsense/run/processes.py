@@ -2,8 +2,7 @@
 
 import socket
 import threading
-import time
-from concurrent.futures import Future, wait
+from concurrent.futures import Future
 
 import jax
 import numpy as np
@@ -70,13 +69,10 @@ def join(
         except BaseException as error:
             joined.set_exception(error)
 
-    end = time.monotonic() + _JOIN_TIMEOUT
     # A signal is not noticed in the thread that waits within JAX.
     threading.Thread(target=initialise, daemon=True).start()
-    while not joined.done() and time.monotonic() < end:
-        wait((joined,), timeout=0.2)
     try:
-        joined.result(timeout=0)
+        joined.result(_JOIN_TIMEOUT)
     except TimeoutError:
         reason = f"not all {number} processes have joined within {_JOIN_TIMEOUT:.0f} s"
         raise ConfigError("coordinator", coordinator, reason) from None

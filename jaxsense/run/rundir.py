@@ -23,7 +23,7 @@ from jaxsense.config.section import require_32_bits
 from jaxsense.core import inside
 from jaxsense.models import Models
 from jaxsense.run import files, output, version
-from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.files import Checkpoints
 from jaxsense.run.settings import Settings, as_json, began, of_run, read_settings, resumable
 from jaxsense.summary.blocks import Made, Origin
 from jaxsense.summary.compare import UNKNOWN

@@ -9,7 +9,7 @@ from tiny import KEY, TINY
 
 from jaxsense import training
 from jaxsense.run import pipeline
-from jaxsense.run.checkpoints import Checkpoints
+from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs
 from jaxsense.training import learn
