@@ -129,3 +129,14 @@ def test_weights_of_reconstruction_may_be_traced():
     traced, constant = jax.jit(loss), jax.jit(lambda: loss((3.0, 0.5)))
     np.testing.assert_allclose(traced((3.0, 0.5)), constant(), rtol=1e-5)
     assert abs(traced((3.0, 0.5)) - traced((1.0, 0.5))) > 0.1
+
+
+def test_arrays_are_checked_like_numbers_unless_they_are_traced_or_a_batch():
+    assert dataclasses.replace(CONFIG.jmvae, alpha=jnp.float32(0.5)).alpha == 0.5
+    with pytest.raises(ValueError, match=r"jmvae.alpha = .*-1.*: must be a number, from 0 to"):
+        dataclasses.replace(CONFIG.jmvae, alpha=jnp.float32(-1.0))
+    batch = jnp.array([0.5, 2.0])
+    many = dataclasses.replace(CONFIG.viewpoint, min_distance=batch)
+    assert dataclasses.replace(CONFIG, viewpoint=many).viewpoint.min_distance is batch
+    traced = jax.jit(lambda x: dataclasses.replace(CONFIG.viewpoint, min_distance=x))(2.0)
+    assert traced.min_distance == 2.0

@@ -27,6 +27,7 @@ from typing import (
 )
 
 import jax
+import numpy as np
 from jax.core import Tracer
 
 from jaxsense.core.types import register
@@ -212,8 +213,8 @@ def _converted(value: object, kind: object, limits: Limits, is_leaf: bool = Fals
 def _scalar(value: object, kind: type, limits: Limits, is_leaf: bool) -> object:
     """A value of a class, as `_converted`."""
     if is_leaf and isinstance(value, jax.Array | jax.ShapeDtypeStruct):
-        if isinstance(value, jax.Array) and not isinstance(value, Tracer) and value.size == 1:
-            _scalar(value.item(), kind, limits, is_leaf=False)
+        if not _is_unknown(value):
+            _scalar(cast(jax.Array, value).item(), kind, limits, is_leaf=False)
         return value
     if kind in (int, float):
         # A whole number is real, and no truth value is a number.
@@ -284,7 +285,7 @@ class Checked:
 class Section(Checked):
     """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
 
-    Relations between fields are not checked while JAX traces one of them.
+    Relations between fields are not checked while JAX traces one of them, or for a batch.
     """
 
     LEAVES: ClassVar[tuple[str, ...]] = ()
@@ -297,8 +298,13 @@ class Section(Checked):
 
     def __post_init__(self):
         check_fields(self)
-        if not any(isinstance(x, Tracer | jax.ShapeDtypeStruct) for x in jax.tree.leaves(self)):
+        if not any(map(_is_unknown, jax.tree.leaves(self))):
             self.check()
+
+
+def _is_unknown(value: object) -> bool:
+    """Whether a leaf is traced, or holds several numbers."""
+    return isinstance(value, Tracer | jax.ShapeDtypeStruct) or np.size(value) != 1  # pyright: ignore[reportArgumentType]
 
 
 def _is_leaf(kind: object) -> bool:
