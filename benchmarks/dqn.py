@@ -1,11 +1,10 @@
-"""Q-learning: environment steps per second on the map MDP, and our DQN as a learner in tasks."""
+"""Q-learning: environment steps per second of one robot, and our DQN as a learner in tasks."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
 
 from benchmarks import measure, peers
 from benchmarks.jmvae import random_bank
@@ -14,10 +13,7 @@ from jaxsense import PRESETS, Bank, Config, Models, init, make_jmvae, make_mdp, 
 from jaxsense.config import DqnConfig
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
-from jaxsense.dqn import training
-from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.dqn.training import Environment
+from jaxsense.dqn import Environment, Mdp, training
 from jaxsense.run import devices
 from jaxsense.tasks.score import Policy
 
@@ -44,14 +40,14 @@ class Task:
     bank: tuple[jax.Array, ...]
 
     @property
-    def mdp(self) -> MapMdp:
+    def mdp(self) -> Mdp:
         """The MDP."""
-        return make_mdp(self.config, self.models, Bank(self.bank)).map
+        return make_mdp(self.config, self.models, Bank(self.bank)).of(MODALITY)
 
     @property
-    def environment(self) -> Environment[PyTree]:
+    def environment(self) -> Environment:
         """What our DQN learns in."""
-        return self.models.agent.environment(self.mdp, MODALITY)
+        return Environment(self.models.agent, self.mdp)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,8 +78,7 @@ class Dqn:
     def train(self, task: tasks.Task, seeds: Sequence[int], steps: int) -> dict[int, Policy]:
         """Trains all seeds in one program."""
         agent = task.models.agent
-        is_team = isinstance(agent, TeamAgent)
-        discount = self.discount_of_a_second if is_team else self.discount
+        discount = self.discount if agent.travel is None else self.discount_of_a_second
         agent = dataclasses.replace(agent, discount=discount)
         epochs = max(1, steps // self.num_envs)
         epochs -= epochs % 100 if epochs > 100 else 0
@@ -144,7 +139,7 @@ def dqn_sb3(options: Options) -> Row:
 def dqn_live(options: Options) -> Row:
     """With a scan cast in each environment's own arena at every step."""
     task = untrained_task(_settings(options, epochs=100))
-    mdp = make_mdp(task.config, task.models).map
+    mdp = make_mdp(task.config, task.models).of(MODALITY)
     return measure.compare("dqn_live", _UNIT, [_our_side(task, mdp)], [], options)
 
 
@@ -160,9 +155,9 @@ def dqn_seeds(options: Options) -> Row:
     num_seeds = 64 if is_accelerated and not options.quick else 2
     modalities, agent = jnp.arange(len(task.config.modalities)), task.models.agent
 
-    def train(keys: jax.Array, mdp: MapMdp):
+    def train(keys: jax.Array, mdp: Mdp):
         def of_one(key: jax.Array, modality: jax.Array):
-            return training.train(key, agent.environment(mdp, modality), settings)
+            return training.train(key, Environment(agent, mdp.of(modality)), settings)
 
         of_seeds = jax.vmap(of_one, (0, None))
         state, infos = jax.vmap(of_seeds, (None, 0))(keys, modalities)
@@ -185,11 +180,11 @@ def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     return settings
 
 
-def _our_side(task: Task, mdp: MapMdp) -> Side:
+def _our_side(task: Task, mdp: Mdp) -> Side:
     settings = task.config.dqn
 
-    def train(key: jax.Array, mdp: MapMdp):
-        return training.train(key, task.models.agent.environment(mdp, MODALITY), settings)
+    def train(key: jax.Array, mdp: Mdp):
+        return training.train(key, Environment(task.models.agent, mdp), settings)
 
     work = settings.epochs * settings.num_envs
     return measure.compiled(train, jax.random.key(2), mdp, work=work, batch=settings.num_envs)

@@ -1,4 +1,4 @@
-"""The team MDP: choices per second of random teams, without learning."""
+"""The MDP of teams: choices per second of random teams, without learning."""
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +7,7 @@ from benchmarks import measure
 from benchmarks.dqn import untrained_task
 from benchmarks.measure import Options, Row
 from jaxsense import PRESETS, Bank, init, make_mdp
-from jaxsense.dqn import team_mdp as teams
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn import Mdp, State, reset, step
 
 
 def team_mdp(options: Options) -> Row:
@@ -17,25 +16,22 @@ def team_mdp(options: Options) -> Row:
     config = PRESETS["team"]
     task = untrained_task(PRESETS["default"].dqn)
     mdp = make_mdp(config, init(jax.random.key(0), config), Bank(task.bank))
-    assert isinstance(mdp, TeamMdp)
 
     @jax.jit
-    def begin(keys: jax.Array, mdp: TeamMdp) -> teams.TeamState:
-        return jax.vmap(lambda key: teams.reset(key, mdp))(keys)
+    def begin(keys: jax.Array, mdp: Mdp) -> State:
+        return jax.vmap(lambda key: reset(key, mdp))(keys)
 
-    def play(key: jax.Array, starts: teams.TeamState, mdp: TeamMdp) -> jax.Array:
+    def play(key: jax.Array, starts: State, mdp: Mdp) -> jax.Array:
         choice_key, look_key = jax.random.split(key)
         draws = jax.random.uniform(choice_key, (steps, number))
         keys = jax.random.split(look_key, (steps, number))
 
-        def step(states, drawn):
+        def choose(states, drawn):
             draw, keys = drawn
             present = jnp.sum(states.team.present, axis=1)
             choice = jnp.floor(draw * (present + 1)).astype(jnp.int32)
-            choice = jnp.where(choice == present, mdp.map.num_pois, choice)
-            states, outcome = jax.vmap(lambda k, s, a: teams.step(k, mdp, s, a))(
-                keys, states, choice
-            )
+            choice = jnp.where(choice == present, mdp.num_pois, choice)
+            states, outcome = jax.vmap(lambda k, s, a: step(k, mdp, s, a))(keys, states, choice)
             ended = outcome.terminated | outcome.truncated
             states = jax.tree.map(
                 lambda x, y: jnp.where(ended.reshape(-1, *[1] * (x.ndim - 1)), x, y),
@@ -44,7 +40,7 @@ def team_mdp(options: Options) -> Row:
             )
             return states, outcome.reward
 
-        return jax.lax.scan(step, starts, (draws, keys))[1]
+        return jax.lax.scan(choose, starts, (draws, keys))[1]
 
     # A start looks at everything it has seen; a training prepares them once.
     starts = begin(jax.random.split(jax.random.key(1), number), mdp)

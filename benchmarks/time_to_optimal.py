@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks import peers
-from benchmarks.dqn import MODALITY, Task
+from benchmarks.dqn import Task
 from benchmarks.measure import Options, Row
 from jaxsense import PRESETS, init, learn
 from jaxsense.config import DetectorConfig, DqnConfig, JmvaeConfig
@@ -74,7 +74,7 @@ class Examiner:
         reset_key, play_key = jax.random.split(jax.random.key(5))
         reset = jax.jit(jax.vmap(lambda key: episodes.reset(key, mdp, exact)))
         self._starts = reset(jax.random.split(reset_key, num_starts))
-        optimal = reference(jax.random.key(0), mdp, MODALITY, task.models, exact.labels)
+        optimal = reference(jax.random.key(0), mdp, task.models, exact.labels)
 
         def learned(params: optax.Params, known: Known, classes: jax.Array) -> jax.Array:
             del classes
@@ -84,11 +84,11 @@ class Examiner:
             values: Callable[[Known, jax.Array], jax.Array], starts: Start
         ) -> jax.Array:
             def play(key: jax.Array, start: Start) -> jax.Array:
-                def act(key: jax.Array, known: Known) -> jax.Array:
+                def act(key: jax.Array, known: Known, memory: tuple[()]):
                     del key
-                    return policies.best(values(known, start.state.classes))
+                    return policies.best(values(known, start.state.classes)), memory
 
-                return episodes.run_episode(key, mdp, exact, act, start, MODALITY)[0]
+                return episodes.run_episode(key, mdp, exact, act, start)[0]
 
             return jnp.mean(jax.vmap(play)(jax.random.split(play_key, num_starts), starts))
 

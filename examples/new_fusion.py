@@ -33,7 +33,7 @@ if __name__ == "__main__":
     mdp, step = jaxsense.make_mdp(config, models), jax.jit(dqn.step)
     state = dqn.reset(start_key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
     for look, key in enumerate(keys):
-        state, outcome = step(key, mdp, state, jnp.int32(0), jnp.int32(look % 2))
+        state, outcome = step(key, mdp.of(jnp.int32(look % 2)), state, jnp.int32(0))
         print(f"sigma {state.belief.std[0]} after look {look + 1}, reward {outcome.reward:.2f}")
     reset = jax.jit(lambda key: mission.reset(key, scenario, models))
     play = jax.jit(lambda key, state: mission.rollout(key, scenario, models, state, 150)[0])

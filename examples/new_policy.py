@@ -1,4 +1,4 @@
-"""A custom policy, in the map MDP and in missions: `python examples/new_policy.py`."""
+"""A custom policy, in the MDP of one robot and in missions: `python examples/new_policy.py`."""
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +20,12 @@ if __name__ == "__main__":
     start_key, play_key = jax.random.split(jax.random.key(0))
     mdp = jaxsense.make_mdp(config, models)
 
-    def act(key: jax.Array, known: dqn.Known) -> jax.Array:
-        """The action in the map MDP."""
-        return policies.best(widest(key, models, known))
+    def act(key: jax.Array, known: dqn.Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+        """The action in the MDP, and what is remembered: nothing."""
+        return policies.best(widest(key, models, known)), memory
 
     start = episodes.reset(start_key, mdp, models.bayes)
-    play = jax.jit(lambda key: episodes.run_episode(key, mdp, models.bayes, act, start, 0))
+    play = jax.jit(lambda key: episodes.run_episode(key, mdp, models.bayes, act, start))
     total, first = play(play_key)
-    print(f"map MDP: total reward {total:.2f}, of the first look {first:.2f}")
+    print(f"one robot: total reward {total:.2f}, of the first look {first:.2f}")
     print(jaxsense.score_missions(config, models, {"widest": widest}, episodes=64))

@@ -32,7 +32,7 @@ if __name__ == "__main__":
     settings = jaxsense.PRESETS["smoke"].dqn  # a short training
     looks = jaxsense.Bank(jaxsense.detections(look_key, config, models, samples=64))
     mdp, reward = jaxsense.make_mdp(config, models, looks), Confident(config.mdp)
-    learning = models.agent.environment(dataclasses.replace(mdp, reward=reward), modality=0)
+    learning = dqn.Environment(models.agent, dataclasses.replace(mdp, reward=reward))
     settings = dataclasses.replace(settings, target_period=5, epsilon_decay=0.9)
     state, info = jax.jit(lambda key: dqn.train(key, learning, settings))(train_key)
     for name, part in (("first", slice(1, 16)), ("last", slice(-15, None))):

@@ -27,12 +27,12 @@ from jaxsense.config.scene import MAX_BEARING
 from jaxsense.config.section import Checked
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
-from jaxsense.dqn.team_mdp import Team, Travel
+from jaxsense.dqn.team import Team
 from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps
 from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
-from jaxsense.models import Models, make_agent, make_jmvae
+from jaxsense.models import Models, make_agent, make_jmvae, make_travel
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
@@ -204,9 +204,7 @@ def _decide(config: Config) -> Function:
             looks=jnp.zeros((mean.shape[0], modalities), jnp.int32),
             log_posterior=jnp.zeros((mean.shape[0], classes)),
             team=team,
-            times=times_to_new_looks(
-                Travel(config.team.travel.view_distance), models.novelty, team, apart
-            ),
+            times=times_to_new_looks(make_travel(config), models.novelty, team, apart),
             robot=robot,
         )
         opinion = ask(key, POLICIES["latent"], models, known)

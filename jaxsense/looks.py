@@ -16,11 +16,11 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from jaxsense.config import Config
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import checks
-from jaxsense.core.types import Key, Samples, pytree
+from jaxsense.core.types import Fusion, Index, Key, Samples, pytree
 from jaxsense.dqn import rewards
-from jaxsense.dqn.map_mdp import Looks, MapMdp
-from jaxsense.dqn.team_mdp import Places, TeamMdp
-from jaxsense.models import Models, require_fitting
+from jaxsense.dqn.mdp import Looks, Mdp
+from jaxsense.dqn.team import Places, Teams
+from jaxsense.models import Models, make_travel, require_fitting
 from jaxsense.sim import world as worlds
 from jaxsense.sim.windows import make_domain
 from jaxsense.sim.world import Scene, World
@@ -29,6 +29,8 @@ from jaxsense.vae.detectors import Detector
 
 _SCENES_AT_ONCE = 512
 _ROUNDING = 1e-5
+_ROBOTS_EACH = 2  # of each modality in a random team, at most
+_MOST_CHOICES = 300  # in an episode of a team
 _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 
@@ -82,8 +84,10 @@ class Bank:
         return samples[scene[poi], row], scene
 
 
-def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapMdp | TeamMdp:
-    """Makes the MDP of `config.dqn.task`: the map MDP of one agent, or the MDP of a team.
+def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
+    """Makes the MDP of `config.dqn.task`: of one robot with the first sensor, or of random teams.
+
+    `Mdp.of` gives the robot another sensor.
 
     Args:
       config: all settings.
@@ -98,6 +102,9 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
     require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
     _require_fitting(config, models, looks)
+    mdp = mdp_of_one(config, models.fusion, looks, 0)
+    if config.dqn.task == "map":
+        return mdp
     settings = config.team
     places = Places(
         sides=settings.sides,
@@ -106,11 +113,21 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> MapM
         num_pois=settings.num_pois[1],
         cells_per_side=settings.cells_per_side,
     )
+    return dataclasses.replace(
+        mdp,
+        config=dataclasses.replace(config.mdp, max_steps=_MOST_CHOICES),
+        num_pois=settings.num_pois[1],
+        robots=jnp.repeat(jnp.arange(len(config.modalities)), _ROBOTS_EACH),
+        teams=Teams(settings, make_travel(config), places, config.modalities),
+    )
 
-    def of_number(num_pois: int) -> MapMdp:
-        return MapMdp(looks, models.fusion, rewards.make(config.mdp), config.mdp, num_pois)
 
-    return models.agent.mdp(of_number, places, config.modalities)
+def mdp_of_one(
+    config: Config, fusion: Fusion, looks: Looks, modality: Index, num_pois: int | None = None
+) -> Mdp:
+    """The MDP of one robot without travel, with as many PoIs as in the arena by default."""
+    number = config.arena.num_pois if num_pois is None else num_pois
+    return Mdp(looks, fusion, rewards.make(config.mdp), config.mdp, number, (modality,))
 
 
 def _require_fitting(config: Config, models: Models, looks: Looks) -> None:

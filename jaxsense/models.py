@@ -14,10 +14,9 @@ from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
-from jaxsense.dqn.map_agent import MapAgent
+from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Agent
-from jaxsense.dqn.team_agent import TeamAgent
+from jaxsense.dqn.team import Travel
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.windows import Domain, make_domain
@@ -195,18 +194,27 @@ def make_models(config: Config, **trained: Any) -> Models:
 
 def make_agent(config: Config) -> Agent:
     """Agent of `config.dqn.task`; a team's reads the reward of a useless look from the settings."""
-    dqn, latent_size = config.dqn, config.jmvae.latent_size
-    if dqn.task == "map":
-        return MapAgent(dqn.discount, config.arena.num_pois, latent_size, dqn.hidden)
-    return TeamAgent(
-        config.team,
-        dqn.discount,
-        rewards.make(config.mdp).of_gain(jnp.float32(0)),
-        latent_size,
-        len(config.modalities),
-        dqn.hidden,
-        config.team.tours.steps > 0,
+    dqn, is_team = config.dqn, config.dqn.task == "team"
+    return Agent(
+        discount=dqn.discount,
+        second_cost=config.team.second_cost,
+        useless=rewards.make(config.mdp).of_gain(jnp.float32(0)) if is_team else 0.0,
+        travel=make_travel(config) if is_team else None,
+        num_pois=config.team.num_pois[1] if is_team else config.arena.num_pois,
+        num_modalities=len(config.modalities),
+        latent_size=config.jmvae.latent_size,
+        hidden=dqn.hidden,
     )
+
+
+def make_travel(config: Config) -> Travel:
+    """How robots travel, according to the team's settings."""
+    return Travel(config.team.travel.view_distance)
+
+
+def orders_looks(config: Config) -> bool:
+    """Whether a network learns in which order to look, see `dqn.tours`."""
+    return config.dqn.task == "team" and config.team.tours.steps > 0
 
 
 def make_readout(config: Config, classes: Belief) -> Readout:
@@ -303,7 +311,7 @@ def init(key: Key, config: Config) -> Models:
         novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         q_networks=tuple(agent.init(k) for k in dqn_keys),
-        tours=agent.init_tours(tours_key),
+        tours=(agent.init(tours_key),) if orders_looks(config) else (),
     )
 
 

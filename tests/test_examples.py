@@ -87,14 +87,14 @@ def test_the_optimum_of_a_product_of_experts_is_that_of_looks_which_add_up(examp
     models = example("new_fusion").multiplying(jaxsense.init(key, config))
     mdp = jaxsense.make_mdp(config, models)
     monkeypatch.setattr(policies, "optimal", lambda key, models, known: "dynamic programming")
-    found = reference(key, mdp, 0, models, models.bayes.labels)
+    found = reference(key, mdp, models, models.bayes.labels)
     assert found(None, None) == "dynamic programming"
 
 
 @pytest.mark.slow
 def test_new_policy(capsys):
     told = printed("new_policy", capsys)
-    assert re.search(r"map MDP: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
+    assert re.search(r"one robot: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
     rows = re.findall(r"^  (\w+) +[01]\.\d{3} +\d+\.\d\d +\d+\.\d ", told, re.MULTILINE)
     assert rows == ["widest", "latent", "auction", "naive", "random"]
 

@@ -13,8 +13,8 @@ from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core.types import Belief
-from jaxsense.dqn import map_mdp, rewards
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import rewards
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
 from jaxsense.vae import fusion, jmvae
@@ -56,7 +56,7 @@ def test_an_mdp_updates_beliefs_by_the_jmvae(models):
     mdp = looks.make_mdp(CONFIG, models, Bank(numbered_bank()))
     assert (mdp.num_pois, mdp.num_classes, mdp.num_modalities) == (3, 3, 2)
     seen = jnp.array([[0, 0], [0, 1], [1, 0]], bool)
-    reset = jax.jit(map_mdp.reset)
+    reset = jax.jit(mdps.reset)
     state = reset(jax.random.key(1), mdp, jnp.array([2, 0, 1]), seen)
     np.testing.assert_allclose(state.belief.std[0], np.sqrt(20.0), rtol=1e-6)
     # PoI 1 is of class 0 and was seen by the LiDAR: one of five beliefs.
@@ -69,13 +69,13 @@ def test_an_mdp_is_an_argument_of_jit(models):
     @jax.jit
     @chex.assert_max_traces(n=1)
     def gain(mdp, state):
-        after, outcome = map_mdp.step(jax.random.key(1), mdp, state, jnp.int32(0), jnp.int32(0))
+        after, outcome = mdps.step(jax.random.key(1), mdp.of(jnp.int32(0)), state, jnp.int32(0))
         return after.belief, outcome.reward
 
     features = tuple(
         jnp.asarray(np.broadcast_to([p, 1 - p], (3, 4, 2)), jnp.float32) for p in (0.5, 0.51)
     )
-    found, reset = [], jax.jit(map_mdp.reset)
+    found, reset = [], jax.jit(mdps.reset)
     posterior = jax.jit(jmvae.posterior, static_argnums=1)
     for number in range(2):
         other = jaxsense.init(jax.random.key(number), CONFIG)
@@ -91,13 +91,14 @@ def test_an_mdp_is_an_argument_of_jit(models):
 def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     config = replace(CONFIG, dqn=replace(CONFIG.dqn, task="team", hidden=(4,)))
     mdp = looks.make_mdp(config, jaxsense.init(jax.random.key(0), config), Bank(numbered_bank()))
-    assert isinstance(mdp, TeamMdp)
-    assert mdp.map.num_pois == config.team.num_pois[1]
-    assert mdp.places.poi_pitch == config.arena.poi_pitch
-    assert mdp.places.robot_radius == PLANNING_RADIUS
+    assert mdp.num_pois == config.team.num_pois[1]
+    assert mdp.robots.tolist() == [0, 0, 1, 1]
+    places = mdp.teams.places
+    assert places.poi_pitch == config.arena.poi_pitch
+    assert places.robot_radius == PLANNING_RADIUS
     # Nothing else of them is an input of a compiled program.
-    assert jax.tree.leaves(mdp.places) == [*config.team.sides, PLANNING_RADIUS]
-    assert mdp.config is config.team
+    assert jax.tree.leaves(places) == [*config.team.sides, PLANNING_RADIUS]
+    assert mdp.teams.config is config.team
 
 
 def test_entropy_by_hand():
@@ -126,13 +127,11 @@ def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(model
     )
     looks_red = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
     mdp = looks.make_mdp(config, replace(models, fusion=found), Bank(looks_red))
-    state = jax.jit(map_mdp.reset)(
-        jax.random.key(0), mdp, np.array([1, 1, 1]), np.zeros((3, 2), bool)
-    )
+    state = jax.jit(mdps.reset)(jax.random.key(0), mdp, np.array([1, 1, 1]), np.zeros((3, 2), bool))
 
     @jax.jit
     def look(mdp, state, modality):
-        return map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(1), modality)
+        return mdps.step(jax.random.key(0), mdp.of(modality), state, jnp.int32(1))
 
     # .2 to .8 to .8 after one look, and .04 to .64 to .64 after two.
     one, two = np.array([1, 4, 4]) / 9, np.array([1, 16, 16]) / 33

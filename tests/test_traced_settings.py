@@ -63,7 +63,7 @@ def learn(config):
     classes = Belief(jnp.eye(3, 2), jnp.full((3, 2), 0.2))
     models = dataclasses.replace(models, fusion=make_in_place(config, params, classes))
     mdp = make_mdp(config, models, Bank(bank))
-    state, info = dqn.train(keys[7], models.agent.environment(mdp, 0), config.dqn)
+    state, info = dqn.train(keys[7], dqn.Environment(models.agent, mdp), config.dqn)
     return {"detector": fit.params, "jmvae": latent, "dqn": (state.params, info)}
 
 

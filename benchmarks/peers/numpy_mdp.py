@@ -29,7 +29,7 @@ class NumpyMap:
 
 
 class NumpyMdp:
-    """`dqn.map_mdp` on a bank of detections, with the same rewards and the same maps."""
+    """`dqn.mdp` of one robot on a bank of detections, with the same rewards and the same maps."""
 
     def __init__(self, config: Config, params: Params, bank: Samples, modality: int):
         """Takes a JMVAE's parameters, a bank `[C, S, D_m]` per modality, and the own sensor."""

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxsense.core.types import Fusion, Index, Key, call, pytree
-from jaxsense.dqn import map_mdp, policies, team_mdp
-from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.core.types import Fusion, Key, call, pytree
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import policies
+from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.optimum import LookValues, steps_of_lattice
 from jaxsense.dqn.policies import Known, Trained
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState, alone
 
 M = TypeVar("M")
 
@@ -42,19 +42,19 @@ class Start:
       log_likelihood: `[N, C]` logarithms of the classes' likelihoods given all earlier looks.
     """
 
-    state: MapState
+    state: State
     log_likelihood: jax.Array
 
 
 def reset(
     key: Key,
-    mdp: MapMdp,
+    mdp: Mdp,
     exact: LogLikelihoods,
     classes: Int[Array, " N"] | None = None,
     seen: Bool[Array, "N M"] | None = None,
 ) -> Start:
-    """Starts an episode, see `map_mdp.reset`."""
-    state, looks = map_mdp.reset_with_looks(key, mdp, classes, seen)
+    """Starts an episode, see `mdp.reset`."""
+    state, looks = mdps.reset_with_looks(key, mdp, classes, seen)
     total = jnp.zeros((mdp.num_pois, mdp.num_classes))
     for m, features in enumerate(looks):
         of_pois = jax.vmap(lambda x: exact.log_likelihoods(x, m))(features)  # noqa: B023
@@ -64,82 +64,64 @@ def reset(
 
 def run_episode(
     key: Key,
-    mdp: MapMdp,
+    mdp: Mdp,
     exact: LogLikelihoods,
-    act: Callable[[Key, Known], jax.Array],
+    act: Callable[[Key, Known, M], tuple[jax.Array, M]],
     start: Start,
-    modality: Index,
+    memory: M = (),
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Plays one episode with a policy.
 
-    With the same key, the k-th look at a PoI shows the same whatever came before, so that policies
-    are compared on the same looks. Under `vmap` it runs until the longest episode has ended.
+    Without travel, the k-th look at a PoI shows the same with the same key whatever came before, so
+    that policies are compared on the same looks. Under `vmap` it runs until the longest episode has
+    ended.
 
     Args:
-      act: `(key, known) -> []` int32 action, see `policies.best`.
+      act: `(key, known, memory) -> []` int32 action, see `policies.best`, and the memory after it.
+      memory: before the first action.
 
     Returns:
-      `[]` total reward, without discount, and `[]` reward of the first action.
+      `[]` total reward, without discount, less the price of all robots' time; and that of the first
+      action.
     """
-
-    def act_alike(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
-        return act(key, known), memory
-
-    return run_recurrent(key, mdp, exact, act_alike, (), start, modality)
-
-
-def run_recurrent(
-    key: Key,
-    mdp: MapMdp,
-    exact: LogLikelihoods,
-    act: Callable[[Key, Known, M], tuple[jax.Array, M]],
-    memory: M,
-    start: Start,
-    modality: Index,
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Plays one episode with a policy that remembers, see `run_episode`.
-
-    Args:
-      act: `(key, known, memory) -> []` int32 action, and the memory after it.
-    """
-    num_pois, team = mdp.num_pois, alone(mdp.num_pois, modality)
-    times = jnp.ones((1, num_pois))
     policy_key, looks_key = jax.random.split(key)
 
     def play(carry: _Carry) -> _Carry:
         state, looks = carry.state, carry.looks
         posterior = jax.nn.log_softmax(carry.log_likelihood)
-        known = Known(state.belief, looks[:num_pois], posterior, team, times, jnp.int32(0))
+        times = mdp.travel.times(state.team)
+        known = Known(state.belief, looks, posterior, state.team, times, state.agent)
         policy = jax.random.fold_in(policy_key, state.steps)
         action, memory = act(policy, known, carry.memory)
-        own = carry.own_looks[action]
-        look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), own)
-        poi = jnp.minimum(action, num_pois - 1)
+        if mdp.teams is None:
+            own = jnp.sum(looks - start.state.seen, axis=1).at[action].get(mode="clip")
+            look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), own)
+        else:
+            look_key = jax.random.fold_in(looks_key, state.steps)
+        after, outcome = mdps.step(look_key, mdp, state, action)
+        poi, modality = outcome.poi, mdp.sensor(after.team, after.agent)
 
         def of_look(m: int) -> jax.Array:
             # The same key yields the same look as in the step.
-            features, _ = mdp.looks.observe(look_key, state.scene, poi, m)
+            place = jnp.minimum(poi, mdp.num_pois - 1)
+            features, _ = mdp.looks.observe(look_key, state.scene, place, m)
             return exact.log_likelihoods(features, m)
 
-        found = jnp.where(action < num_pois, call(of_look, modality, mdp.num_modalities), 0.0)
-        after, outcome = map_mdp.step(look_key, mdp, state, action, modality)
-        is_first = state.steps == start.state.steps
+        found = call(of_look, modality, mdp.num_modalities)
+        earned = mdp.earned(outcome, after.team)
         return _Carry(
             state=after,
-            looks=looks.at[action, modality].add(1),
-            own_looks=carry.own_looks.at[action].add(1),
-            log_likelihood=carry.log_likelihood.at[poi].add(found),
+            looks=looks.at[poi, modality].add(1, mode="drop"),
+            log_likelihood=carry.log_likelihood.at[poi].add(found, mode="drop"),
             memory=memory,
             done=outcome.terminated | outcome.truncated,
-            total=carry.total + outcome.reward,
-            first=jnp.where(is_first, outcome.reward, carry.first),
+            total=carry.total + earned,
+            first=jnp.where(state.steps == start.state.steps, earned, carry.first),
         )
 
-    looks = jnp.concatenate([start.state.seen, jnp.zeros((1, mdp.num_modalities), bool)])
     carry = _Carry(
         state=start.state,
-        looks=looks.astype(jnp.int32),
-        own_looks=jnp.zeros(num_pois + 1, jnp.int32),
+        looks=start.state.seen.astype(jnp.int32),
         log_likelihood=start.log_likelihood,
         memory=memory,
         done=jnp.bool_(False),
@@ -150,50 +132,12 @@ def run_recurrent(
     return end.total, end.first
 
 
-def run_team(
-    key: Key,
-    mdp: TeamMdp,
-    act: Callable[[Key, TeamState, Known, M], tuple[jax.Array, M]],
-    memory: M,
-    start: TeamState,
-) -> Float[Array, ""]:
-    """Rewards of all looks less the price of all robots' time, in one episode of a team.
-
-    Args:
-      act: `(key, state, known, memory) -> []` int32 choice of robot `state.agent`, and the memory
-        after it. What is known holds no posterior: classes are equally likely in it.
-    """
-    policy_key, looks_key = jax.random.split(key)
-    num_pois = mdp.map.num_pois
-    uniform = jnp.zeros((num_pois, mdp.map.num_classes)) - jnp.log(mdp.map.num_classes)
-
-    def play(carry: tuple[TeamState, jax.Array, M, jax.Array, jax.Array]):
-        state, looks, memory, _, total = carry
-        step = state.map.steps
-        times = team_mdp.travel_times(mdp.travel, state.team)
-        known = Known(state.map.belief, looks, uniform, state.team, times, state.agent)
-        action, memory = act(jax.random.fold_in(policy_key, step), state, known, memory)
-        after, outcome = team_mdp.step(jax.random.fold_in(looks_key, step), mdp, state, action)
-        target = state.team.target.at[state.agent].set(action)[after.agent]
-        # Choices take no time, looks do; NOP, beyond the last row, is no look.
-        seconds = jnp.asarray(outcome.seconds)
-        own = after.team.modality[after.agent]
-        looks = looks.at[target, own].add((seconds > 0).astype(jnp.int32), mode="drop")
-        total += outcome.reward - mdp.time_price(after.team, seconds)
-        return after, looks, memory, outcome.terminated | outcome.truncated, total
-
-    seen = start.map.seen.astype(jnp.int32)
-    begin = start, seen, memory, jnp.bool_(False), jnp.float32(0.0)
-    return jax.lax.while_loop(lambda carry: ~carry[3], play, begin)[4]
-
-
 @pytree
 class _Carry:
-    """An episode under way; `[N + 1]` looks and choices of NOP."""
+    """An episode under way."""
 
-    state: MapState
+    state: State
     looks: jax.Array
-    own_looks: jax.Array
     log_likelihood: jax.Array
     memory: PyTree
     done: jax.Array
@@ -236,10 +180,8 @@ Reference = Callable[[Known, jax.Array], jax.Array]
 """`(known, classes [N]) -> [N + 1]` values; the true classes are hidden from all other policies."""
 
 
-def reference(
-    key: Key, mdp: MapMdp, modality: Index, models: Trained, labels: Int[Array, "M C"]
-) -> Reference:
-    """The optimal policy of an MDP, which learned policies are measured against.
+def reference(key: Key, mdp: Mdp, models: Trained, labels: Int[Array, "M C"]) -> Reference:
+    """The optimal policy of one robot without travel, which learned policies are measured against.
 
     Where beliefs accumulate looks, it is the policy `optimal` of missions, by dynamic programming
     on the exact posterior. Where a look replaces the one before, a second look by the same sensor
@@ -253,7 +195,7 @@ def reference(
     """
     if mdp.fusion.accumulates:
         return lambda known, classes: policies.optimal(key, models, known)
-    rewards = expected_rewards(key, mdp, modality)
+    rewards = expected_rewards(key, mdp)
     return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
 
 
@@ -270,10 +212,8 @@ def has_optimum(fusion: Fusion, values: LookValues, is_sound: bool) -> bool:
     return not fusion.accumulates or steps_of_lattice(number, len(values.q)) >= _FINE
 
 
-def expected_rewards(
-    key: Key, mdp: MapMdp, modality: Index, num_draws: int = _NUM_DRAWS
-) -> Float[Array, "codes C"]:
-    """Expected reward of a look, by class and earlier looks.
+def expected_rewards(key: Key, mdp: Mdp, num_draws: int = _NUM_DRAWS) -> Float[Array, "codes C"]:
+    """Expected reward of one robot's look, by class and earlier looks.
 
     Returns:
       `[2^M, C]` mean reward of looking at a PoI of class c after looks by the modalities m whose
@@ -286,8 +226,8 @@ def expected_rewards(
         bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
         seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
         classes = jnp.full(mdp.num_pois, poi_class)
-        state = map_mdp.reset(reset_key, mdp, classes, seen)
-        return map_mdp.step(look_key, mdp, state, jnp.int32(0), modality)[1].reward
+        state = mdps.reset(reset_key, mdp, classes, seen)
+        return mdps.step(look_key, mdp, state, jnp.int32(0))[1].reward
 
     # Along one axis: one `vmap` in another takes three times as long to compile.
     shape = (2**mdp.num_modalities, mdp.num_classes, num_draws)

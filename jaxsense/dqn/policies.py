@@ -1,4 +1,4 @@
-"""The table of policies, for the map MDP and for missions.
+"""The table of policies, for the MDP and for missions.
 
 A policy maps trained models and what a robot knows to `[N + 1]` values of actions, the highest of
 which is taken; the last is NOP's. A custom policy is one more entry of a table.
@@ -14,45 +14,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import ConfigError
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn.map_agent import MapAgent
+from jaxsense.core.types import Belief, Fusion, Key
+from jaxsense.dqn import hybrid
+from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.dqn.team_mdp import Team
-
-Agent = MapAgent | TeamAgent
-"""How a Q-network is used; its parameters are kept apart."""
+from jaxsense.dqn.team import Known, Team
 
 _TAKEN = 1e2  # s, detour that a robot prefers to a PoI where another is heading
-
-
-@pytree
-class Known:
-    """Input of a policy: what a robot knows when it chooses.
-
-    Attributes:
-      looks: `[N, M]` int32, looks of each modality at each PoI.
-      log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes.
-      team: robots and PoIs at this moment; PoIs that the robot has given up are not present.
-      times: `[R, N]` seconds until each robot has looked at each PoI, by the travel model.
-    """
-
-    belief: Belief
-    looks: jax.Array
-    log_posterior: jax.Array
-    team: Team
-    times: jax.Array
-    robot: jax.Array
-
-    @property
-    def modality(self) -> jax.Array:
-        """`[]` int32 index of the robot's own sensor."""
-        return self.team.modality[self.robot]
-
-    @property
-    def is_seen(self) -> jax.Array:
-        """Mask `[N]` of the PoIs that any robot has looked at."""
-        return jnp.any(self.looks > 0, axis=-1)
 
 
 class Trained(Protocol):
@@ -93,7 +61,7 @@ class Policy:
     """A policy: a function that values looks, and how missions use the values.
 
     Attributes:
-      counts_time: `agent -> bool`, whether the values include travel time, so that no other rule
+      counts_time: `models -> bool`, whether the values include travel time, so that no other rule
         needs to order looks.
       is_unordered: whether looks that pay may be taken in any order, so that missions choose one,
         see `mission.auctions` in the settings.
@@ -102,7 +70,7 @@ class Policy:
     """
 
     values: Values
-    counts_time: Callable[[Agent], bool] = lambda agent: False
+    counts_time: Callable[["Trained"], bool] = lambda models: False
     is_unordered: bool = False
     worth: Values | None = None
 
@@ -151,21 +119,15 @@ def expected_gain(
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     """Asks the trained Q-network."""
     del key
-    return models.agent.decide(
-        _own_network(models, known),
-        models.tours,
-        models.fusion.classes,
-        known.belief,
-        known.team,
-        known.robot,
-    )
+    own, classes = _own_network(models, known), models.fusion.classes
+    return hybrid.decide(models.agent, own, models.tours, classes, known)
 
 
 def latent_worth(key: Key, models: Trained, known: Known) -> Float[Array, " N"]:
     """Asks the trained Q-network which looks pay."""
     del key
-    q_network, classes = _own_network(models, known), models.fusion.classes
-    return models.agent.worth(q_network, classes, known.belief, known.team, known.robot)
+    own, classes = _own_network(models, known), models.fusion.classes
+    return hybrid.worth(models.agent, own, classes, known)
 
 
 def greedy(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -277,7 +239,7 @@ def _by_rule(rule: Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array])
         del key
         return rule(_gains(models, known), known.times, known.team, known.robot)
 
-    return Policy(values, lambda agent: True)
+    return Policy(values, lambda models: True)
 
 
 def _gains(models: Trained, known: Known) -> jax.Array:
@@ -293,8 +255,8 @@ def _own_network(models: Trained, known: Known) -> Params:
 
 
 POLICIES: dict[str, Policy] = {
-    "latent": Policy(latent, lambda agent: agent.counts_time, True, latent_worth),
-    "network": Policy(latent, lambda agent: True),
+    "latent": Policy(latent, lambda models: bool(models.tours), True, latent_worth),
+    "network": Policy(latent, lambda models: True),
     "greedy": Policy(greedy, is_unordered=True),
     "bayes": Policy(bayes, is_unordered=True),
     "optimal": Policy(optimal, is_unordered=True),

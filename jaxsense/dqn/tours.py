@@ -1,6 +1,6 @@
 """Time until the robots of a team are done after each choice, learned from simulated trials.
 
-A discounted Q-network, see `team_mdp`, predicts what a look is worth but barely reflects the end of
+A discounted Q-network predicts what a look is worth but barely reflects the end of
 a mission: it puts off remote PoIs, and returning to them takes long. Therefore several choices of a
 robot are tried from the same state and with the same random numbers. After each, all robots follow
 a given policy until they are done, and a second network learns which choice ends soonest: one step
@@ -13,16 +13,16 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.learning import ToursConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import team_mdp
-from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import TIME_SCALE, TeamMdp, TeamState, travel_seconds
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.agent import Agent
+from jaxsense.dqn.mdp import Mdp, State
+from jaxsense.dqn.team import TIME_SCALE
 from jaxsense.dqn.training import pseudo_huber
 
 
@@ -36,7 +36,7 @@ class Policy(Protocol):
         """`[G]` what the policy reads of one PoI."""
         ...
 
-    def values(self, read: Float[Array, "N G"], state: TeamState) -> Float[Array, " A"]:
+    def values(self, read: Float[Array, "N G"], state: State) -> Float[Array, " A"]:
         """Values of actions, `[N + 1]`, NOP's last; robots take the action of the highest."""
         ...
 
@@ -45,7 +45,7 @@ class Policy(Protocol):
 class _Now:
     """A state, and `[N, G]` what the policy has read of its map."""
 
-    state: TeamState
+    state: State
     read: jax.Array
 
 
@@ -73,41 +73,37 @@ class Trials:
     seconds: jax.Array
 
 
-def try_choices(key: Key, mdp: TeamMdp, policy: Policy, number: int) -> Trials:
+def try_choices(key: Key, mdp: Mdp, policy: Policy, number: int) -> Trials:
     """Tries choices in random states."""
     # Alone, all PoIs share a position, so there is no order to learn.
-    mdp = dataclasses.replace(mdp, alone=0.0)
+    assert mdp.teams is not None
+    mdp = dataclasses.replace(mdp, teams=dataclasses.replace(mdp.teams, alone=0.0))
     keys = jax.random.split(key, number)
     return jax.vmap(lambda key: _trial(key, mdp, policy), out_axes=-1)(keys)
 
 
-def _trial(key: Key, mdp: TeamMdp, policy: Policy) -> Trials:
+def _trial(key: Key, mdp: Mdp, policy: Policy) -> Trials:
     """The trials from one state, `[F * N]` and `[N]`."""
     start_key, walk_key, tried_key, play_key = jax.random.split(key, 4)
-    first = team_mdp.reset(start_key, mdp)
-    read = jax.vmap(policy.read)(first.map.belief, jnp.any(first.map.seen, axis=-1))
+    first = mdps.reset(start_key, mdp)
+    read = jax.vmap(policy.read)(first.belief, jnp.any(first.seen, axis=-1))
     now = _some_way_on(walk_key, mdp, policy, _Now(first, read))
-    state, num_pois = now.state, mdp.map.num_pois
+    state, num_pois = now.state, mdp.num_pois
     values = policy.values(now.read, state)
     is_open = values[:-1] > values[-1]
-    travel = mdp.travel
-    pose = state.team.poses[state.agent]
-    times = travel_seconds(travel, pose, state.team.positions)
+    times = mdp.travel.times(state.team)[state.agent]
     rank = jnp.where(is_open, jax.random.gumbel(tried_key, (num_pois,)) - times / _NEAR, -jnp.inf)
     tried = jax.lax.top_k(rank, min(_TRIES, num_pois))[1]
     seconds = jax.vmap(lambda poi: _seconds_to_end(play_key, mdp, policy, now, poi))(tried)
     is_choice = jnp.sum(is_open) > 1
-    observation = team_mdp.observation(
-        travel, state.map.belief, state.team, state.agent, mdp.map.num_modalities
-    )
     return Trials(
-        observation=observation.reshape(-1),
+        observation=mdp.features(state.belief, state.team, state.agent).T.reshape(-1),
         is_tried=jnp.zeros(num_pois, bool).at[tried].set(is_open[tried] & is_choice),
         seconds=jnp.zeros(num_pois).at[tried].set(seconds),
     )
 
 
-def _some_way_on(key: Key, mdp: TeamMdp, policy: Policy, now: _Now) -> _Now:
+def _some_way_on(key: Key, mdp: Mdp, policy: Policy, now: _Now) -> _Now:
     """Follows the policy for up to `_WALK` random choices."""
     number_key, step_key = jax.random.split(key)
     number = jax.random.randint(number_key, (), 0, _WALK + 1)
@@ -119,17 +115,17 @@ def _some_way_on(key: Key, mdp: TeamMdp, policy: Policy, now: _Now) -> _Now:
     return jax.lax.fori_loop(0, number, advance, now)
 
 
-def _seconds_to_end(key: Key, mdp: TeamMdp, policy: Policy, now: _Now, poi: jax.Array) -> jax.Array:
+def _seconds_to_end(key: Key, mdp: Mdp, policy: Policy, now: _Now, poi: jax.Array) -> jax.Array:
     """`[]` mean seconds until a working robot is done if one sets out for a PoI."""
     begin_key, step_key = jax.random.split(key)
     state = now.state
     after, _ = _step(begin_key, mdp, policy, now, poi)
 
-    def ends_of(now: TeamState, ends: jax.Array) -> jax.Array:
+    def ends_of(now: State, ends: jax.Array) -> jax.Array:
         return jnp.where(now.team.works, now.seconds, ends)
 
     def goes_on(carry: tuple[_Now, jax.Array, jax.Array]) -> jax.Array:
-        return jnp.any(carry[0].state.team.works) & (carry[2] < mdp.max_steps)
+        return jnp.any(carry[0].state.team.works) & (carry[2] < mdp.config.max_steps)
 
     def advance(carry: tuple[_Now, jax.Array, jax.Array]):
         now, ends, i = carry
@@ -143,29 +139,28 @@ def _seconds_to_end(key: Key, mdp: TeamMdp, policy: Policy, now: _Now, poi: jax.
     return jnp.sum(took) / jnp.maximum(jnp.sum(state.team.works), 1)
 
 
-def _follow(key: Key, mdp: TeamMdp, policy: Policy, now: _Now) -> tuple[_Now, jax.Array]:
+def _follow(key: Key, mdp: Mdp, policy: Policy, now: _Now) -> tuple[_Now, jax.Array]:
     """What follows the policy's choice, and `[]` bool, whether all robots are done."""
     action = jnp.argmax(policy.values(now.read, now.state)).astype(jnp.int32)
     return _step(key, mdp, policy, now, action)
 
 
 def _step(
-    key: Key, mdp: TeamMdp, policy: Policy, now: _Now, action: jax.Array
+    key: Key, mdp: Mdp, policy: Policy, now: _Now, action: jax.Array
 ) -> tuple[_Now, jax.Array]:
     """What follows a choice, and `[]` bool, whether all robots are done."""
-    before = now.state
-    after, outcome = team_mdp.step(key, mdp, before, action)
-    # If a robot has looked, it is the one that chooses next. NOP is beyond the last row.
-    poi = before.team.target.at[before.agent].set(action)[after.agent]
-    belief = jax.tree.map(lambda x: x.at[poi].get(mode="clip"), after.map.belief)
-    found = policy.read(belief, jnp.any(after.map.seen.at[poi].get(mode="clip")))
+    after, outcome = mdps.step(key, mdp, now.state, action)
+    poi = outcome.poi  # that of no look is beyond the last row
+    belief = jax.tree.map(lambda x: x.at[poi].get(mode="clip"), after.belief)
+    found = policy.read(belief, jnp.any(after.seen.at[poi].get(mode="clip")))
     return _Now(after, now.read.at[poi].set(found, mode="drop")), outcome.terminated
 
 
-def no_trials(num_features: int, num_pois: int, number: int) -> Trials:
+def no_trials(agent: Agent, number: int) -> Trials:
     """An empty buffer of trials."""
+    num_pois = agent.num_pois
     return Trials(
-        observation=jnp.zeros((num_features * num_pois, number)),
+        observation=jnp.zeros((agent.network.features * num_pois, number)),
         is_tried=jnp.zeros((num_pois, number), bool),
         seconds=jnp.zeros((num_pois, number)),
     )
@@ -181,16 +176,15 @@ def write(trials: Trials, found: Trials, column: Int[Array, ""]) -> Trials:
 
 
 def seconds(
-    network: PoolingNetwork, params: Params, observation: Float[Array, "S ..."], latent_size: int
+    agent: Agent, params: Params, observation: Float[Array, "S ..."]
 ) -> Float[Array, "N ..."]:
     """Mean seconds until robots are done if this one sets out for each PoI, up to a constant.
 
     Returns:
       `[N, ...]`; only differences between PoIs that are present have a meaning.
     """
-    learned = networks.apply(network, params, observation)[:-1]
-    observed = observation.reshape((network.features, *learned.shape))
-    return team_mdp.own_seconds(observed, latent_size) + TIME_SCALE * learned
+    learned = networks.apply(agent.network, params, observation)[:-1]
+    return agent.seconds(observation) + TIME_SCALE * learned
 
 
 @pytree
@@ -199,8 +193,7 @@ class Fitting:
 
     config: ToursConfig
     trials: Trials
-    network: PoolingNetwork = struct.field(pytree_node=False)
-    latent_size: int = struct.field(pytree_node=False)
+    agent: Agent
 
     def draw(self, key: Key, number: int) -> Int[Array, "T B"]:
         """Draws states in which choices were tried, see `supervised.Problem.draw`."""
@@ -215,7 +208,7 @@ class Fitting:
         """Mean error of a batch."""
         del step
         trials = jax.tree.map(lambda x: x[:, drawn], self.trials)
-        predicted = seconds(self.network, params, trials.observation, self.latent_size)
+        predicted = seconds(self.agent, params, trials.observation)
         error = _differences(trials.seconds - predicted, trials.is_tried)
         number = jnp.maximum(jnp.sum(trials.is_tried), 1)
         return jnp.sum(jnp.where(trials.is_tried, pseudo_huber(error / _ERROR), 0.0)) / number

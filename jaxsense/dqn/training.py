@@ -6,23 +6,20 @@ Random numbers are drawn once for a whole chunk of epochs: in the loop they woul
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, Generic, Protocol, TypeVar
 
 import chex
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import DqnConfig
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key, Transition, pytree
 from jaxsense.dqn import replay
-from jaxsense.dqn.map_mdp import MapMdp, Outcome
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.dqn.agent import Environment, Underway
 
-S = TypeVar("S")
 Evaluate = Callable[[Key, Params], jax.Array]
 """`(key, parameters) -> []` total reward of the learned policy."""
 _EVALUATED = 10  # epochs
@@ -30,48 +27,8 @@ _FIRST_EPSILON = 1.0
 _FINAL_RATE = 0.01  # share of the learning rate that is left in the last epoch
 
 
-class Environment(Protocol, Generic[S]):
-    """An environment of one learner; a frozen pytree."""
-
-    @property
-    def agent(self) -> Any:
-        """The learner, see `dqn.policies.Agent`."""
-        ...
-
-    @property
-    def mdp(self) -> MapMdp | TeamMdp:
-        """Of one robot or of a team."""
-        ...
-
-    @property
-    def num_actions(self) -> int:
-        """A; the last action is NOP."""
-        ...
-
-    def reset(self, key: Key) -> S:
-        """A random first state."""
-        ...
-
-    def action_mask(self, state: S) -> Bool[Array, " A"]:
-        """Actions that exist."""
-        ...
-
-    def observe(self, state: S) -> Float[Array, " S"]:
-        """Input of the agent's network."""
-        ...
-
-    def step(
-        self, key: Key, state: S, s_tm1: Float[Array, " S"], action: Int[Array, ""]
-    ) -> tuple[S, Transition, Outcome]:
-        """The state after an action, the transition to learn from and the outcome.
-
-        `s_tm1` is what `observe` returned for the state.
-        """
-        ...
-
-
 @pytree
-class DqnState(Generic[S]):
+class DqnState:
     """State of a training between two chunks of epochs.
 
     Attributes:
@@ -84,7 +41,7 @@ class DqnState(Generic[S]):
     target: Params
     optimiser: optax.OptState
     replay: replay.Replay
-    envs: S
+    envs: Underway
     done: jax.Array
     total_reward: jax.Array
     epoch: jax.Array
@@ -131,7 +88,7 @@ class _Draws:
     replay: jax.Array
 
 
-def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) -> DqnState[S]:
+def init(key: Key, environment: Environment, config: DqnConfig, prepared: Underway) -> DqnState:
     """The state before the first chunk: a new network, an empty replay, no episode started.
 
     Args:
@@ -153,7 +110,7 @@ def init(key: Key, environment: Environment[S], config: DqnConfig, prepared: S) 
     )
 
 
-def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
+def starts(key: Key, environment: Environment, config: DqnConfig) -> Underway:
     """Random states, `[num_starts]`, for episodes to start from.
 
     A training prepares them once: a start simulates every look already taken, which costs far more
@@ -162,9 +119,7 @@ def starts(key: Key, environment: Environment[S], config: DqnConfig) -> S:
     return jax.vmap(environment.reset)(jax.random.split(key, config.num_starts))
 
 
-def train(
-    key: Key, environment: Environment[S], config: DqnConfig
-) -> tuple[DqnState[S], EpochInfo]:
+def train(key: Key, environment: Environment, config: DqnConfig) -> tuple[DqnState, EpochInfo]:
     """Trains one agent by deep Q-learning; `vmap` over `key` for several seeds."""
     checks.require_key(key)
     init_key, start_key, chunk_key = jax.random.split(key, 3)
@@ -179,12 +134,12 @@ def train(
 
 def train_chunk(
     key: Key,
-    environment: Environment[S],
+    environment: Environment,
     config: DqnConfig,
-    state: DqnState[S],
-    prepared: S,
+    state: DqnState,
+    prepared: Underway,
     evaluation: Callable[[Key], Evaluate] | None = None,
-) -> tuple[DqnState[S], EpochInfo]:
+) -> tuple[DqnState, EpochInfo]:
     """Trains for `config.chunk` epochs.
 
     Args:
@@ -205,7 +160,7 @@ def train_chunk(
     evaluate = evaluation(start_key)
     every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
 
-    def advance(state: DqnState[S], of_group: tuple[Key, _Draws]) -> tuple[DqnState[S], EpochInfo]:
+    def advance(state: DqnState, of_group: tuple[Key, _Draws]) -> tuple[DqnState, EpochInfo]:
         key, draws = of_group
         state, infos = jax.lax.scan(epoch, state, draws)
         found = jnp.full(every, jnp.nan).at[-1].set(evaluate(key, state.params))
@@ -232,12 +187,12 @@ def _draw(keys: Sequence[Key], config: DqnConfig) -> _Draws:
 
 
 def _epoch(
-    environment: Environment[S],
+    environment: Environment,
     config: DqnConfig,
-    shares: S,
-    state: DqnState[S],
+    shares: Underway,
+    state: DqnState,
     draws: _Draws,
-) -> tuple[DqnState[S], EpochInfo]:
+) -> tuple[DqnState, EpochInfo]:
     """One step of each environment and `config.updates` gradient steps."""
     decay = jax.lax.pow(jnp.asarray(config.epsilon_decay, jnp.float32), state.epoch)
     epsilon = jnp.maximum(config.epsilon_min, _FIRST_EPSILON * decay)
@@ -278,13 +233,13 @@ def _epoch(
 
 
 def _explore(
-    environment: Environment[S],
+    environment: Environment,
     config: DqnConfig,
     params: Params,
-    started: S,
+    started: Underway,
     epsilon: jax.Array,
     draws: _Draws,
-) -> tuple[S, jax.Array, Transition, jax.Array]:
+) -> tuple[Underway, jax.Array, Transition, jax.Array]:
     """Next states, which episodes have ended, transitions and `[A, E]` values before them."""
     s_tm1 = jax.vmap(environment.observe, out_axes=-1)(started)
     values = environment.agent.values(params, s_tm1)
@@ -297,7 +252,7 @@ def _explore(
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
-def _explored(environment: Environment[S], states: S, draws: jax.Array) -> jax.Array:
+def _explored(environment: Environment, states: Underway, draws: jax.Array) -> jax.Array:
     """Random `[E]` int32 actions that exist in `[E]` states, from `[E]` draws in [0, 1)."""
     exist = jax.vmap(environment.action_mask)(states)
     number = jnp.floor(draws * jnp.sum(exist, axis=1, dtype=draws.dtype)).astype(jnp.int32)
@@ -306,8 +261,8 @@ def _explored(environment: Environment[S], states: S, draws: jax.Array) -> jax.A
 
 def _learn(
     config: DqnConfig,
-    environment: Environment[S],
-    state: DqnState[S],
+    environment: Environment,
+    state: DqnState,
     memory: replay.Replay,
     draws: jax.Array,
 ) -> tuple[Params, optax.OptState, jax.Array]:
@@ -341,7 +296,7 @@ def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
     return optax.flatten(optax.adam(schedule))
 
 
-def _restart(rows: jax.Array, envs: S, shares: S, done: jax.Array) -> S:
+def _restart(rows: jax.Array, envs: Underway, shares: Underway, done: jax.Array) -> Underway:
     """Restarts each environment that needs it from that row of its share."""
 
     def pick(env: jax.Array, share: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 """What the interfaces share: imports of extras, spaces, starts, and robots of a team."""
 
 import contextlib
+import dataclasses
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -14,11 +15,10 @@ from jaxsense.config import Config
 from jaxsense.config.whole import names_of_robots
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn import team_mdp
-from jaxsense.dqn.map_mdp import MapMdp
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState
-from jaxsense.tasks.environment import Environment, OneAgent, Scaling, TimeStep
-from jaxsense.tasks.task import Task, TeamTask
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.mdp import Mdp, State
+from jaxsense.tasks.environment import Environment, Scaling, TimeStep
+from jaxsense.tasks.task import Task
 
 T = TypeVar("T")
 
@@ -34,26 +34,27 @@ def extra(name: str) -> Iterator[None]:
         raise ModuleNotFoundError(message, name=package) from None
 
 
-def environment(mdp: MapMdp | Environment, modality: int | None) -> Environment:
-    """A task as it is, or the map MDP of the agent whose sensor has the index `modality`."""
-    if isinstance(mdp, MapMdp):
+def environment(mdp: Mdp | Environment, modality: int | None) -> Environment:
+    """A task as it is, or the MDP of one robot whose sensor has the index `modality`."""
+    if isinstance(mdp, Mdp):
+        if mdp.teams is not None:
+            raise ValueError("mdp is of teams: must be of one robot, with dqn.task = 'map'")
         checks.require_index("modality", modality, mdp.num_modalities)
-        return OneAgent(mdp, modality)  # pyright: ignore[reportArgumentType]
+        return Environment(mdp.of(modality))  # pyright: ignore[reportArgumentType]
     if modality is not None:
         raise ValueError(f"modality = {modality}: must be None with a task, which has its agent")
     return mdp
 
 
-def prepared_starts(key: Key, mdp: MapMdp | Environment, number: int) -> PyTree:
-    """Random states, `[number]`, of a task or a map MDP, for episodes to start from.
+def prepared_starts(key: Key, mdp: Mdp | Environment, number: int) -> PyTree:
+    """Random states, `[number]`, of a task or an MDP, for episodes to start from.
 
     A start looks at everything it has seen, which costs several steps; a draw from a few thousand
     prepared ones costs nothing.
     """
     checks.require_key(key)
     checks.require_number("number of starts", number)
-    # A start is the same for all sensors.
-    played = OneAgent(mdp, 0) if isinstance(mdp, MapMdp) else mdp
+    played = Environment(mdp) if isinstance(mdp, Mdp) else mdp
     reset = jax.jit(jax.vmap(lambda key, played: played.reset(key)[1], (0, None)))
     return reset(jax.random.split(key, number), played)
 
@@ -77,26 +78,24 @@ class Robots:
     its look and chooses next; each robot that works pays for the time that passed.
 
     Attributes:
-      mdp: the MDP.
-      sensors: `[R]` int32 index of each robot's sensor.
-      scaling: of observations; None for those of `team_mdp.observation`.
+      mdp: the MDP, whose `robots` these are.
+      scaling: of observations; None for those of `dqn.team.surroundings`.
       names: of the robots.
     """
 
-    mdp: TeamMdp
-    sensors: jax.Array
+    mdp: Mdp
     scaling: Scaling | None
     names: tuple[str, ...] = struct.field(pytree_node=False)
 
     @property
     def observation_size(self) -> int:
         """S."""
-        return self.mdp.num_features * self.mdp.map.num_pois
+        return self.mdp.num_features * self.mdp.num_pois
 
     @property
     def num_actions(self) -> int:
         """A look at each PoI, and NOP."""
-        return self.mdp.map.num_pois + 1
+        return self.mdp.num_actions
 
     @property
     def bound(self) -> float:
@@ -107,27 +106,27 @@ class Robots:
         """`[R, ...]` by the names of the robots."""
         return dict(zip(self.names, of_robots, strict=True))
 
-    def reset(self, key: Key) -> TeamState:
+    def reset(self, key: Key) -> State:
         """Starts an episode of all robots."""
-        return team_mdp.reset(key, self.mdp, self.sensors)
+        return mdps.reset(key, self.mdp)
 
-    def observe(self, state: TeamState) -> Float[Array, "R S"]:
+    def observe(self, state: State) -> Float[Array, "R S"]:
         """What each robot knows."""
 
         def observation(robot: jax.Array) -> jax.Array:
-            features = self.mdp.observe(state, robot)
-            return features.reshape(-1) if self.scaling is None else self.scaling(features.T)
+            features = self.mdp.features(state.belief, state.team, robot)
+            return features.T.reshape(-1) if self.scaling is None else self.scaling(features)
 
         return jax.vmap(observation)(jnp.arange(len(self.names)))
 
-    def action_mask(self, state: TeamState) -> Bool[Array, "R A"]:
+    def action_mask(self, state: State) -> Bool[Array, "R A"]:
         """Actions of each robot: the PoIs that are present, if it is its turn, and NOP."""
         chooses = state.team.works & (jnp.arange(len(self.names)) == state.agent)
-        return (chooses[:, None] & team_mdp.action_mask(state)[None]).at[:, -1].set(True)
+        return (chooses[:, None] & state.team.action_mask[None]).at[:, -1].set(True)
 
     def step(
-        self, key: Key, state: TeamState, actions: Int[Array, " R"]
-    ) -> tuple[TeamState, TimeStep, Float[Array, ""]]:
+        self, key: Key, state: State, actions: Int[Array, " R"]
+    ) -> tuple[State, TimeStep, Float[Array, ""]]:
         """Lets the robot choose whose turn it is; a PoI that is not present counts as NOP.
 
         Traced actions that do not exist are not refused: they have a reward of NaN.
@@ -137,24 +136,28 @@ class Robots:
           it would go on at the limit; and the seconds that passed.
         """
         checks.require_index("actions", actions, self.num_actions)
-        action = team_mdp.existing(state, actions[state.agent])
-        after, outcome = team_mdp.step(key, self.mdp, state, action)
-        works, seconds = after.team.works, jnp.asarray(outcome.seconds)
-        price = jnp.where(works, self.mdp.config.second_cost * seconds, 0.0)
+        action = state.team.existing(actions[state.agent])
+        after, outcome = mdps.step(key, self.mdp, state, action)
+        works, seconds = after.team.works, outcome.seconds
+        price = jnp.where(works, self.mdp.second_cost * seconds, 0.0)
         earned = jnp.where(jnp.arange(len(self.names)) == after.agent, outcome.reward, 0.0)
         found = TimeStep(self.observe(after), earned - price, ~works, works & outcome.truncated)
         return after, found, seconds
 
 
-def robots_of(mdp: TeamMdp | Task, config: Config | None = None) -> Robots:
-    """Robots of a task; or of the MDP of a team, with the settings that name them."""
-    if isinstance(mdp, TeamTask) and config is None:
-        carried = tuple(mdp.modalities[m] for m in mdp.robots.tolist())
-        return Robots(mdp.mdp, mdp.robots, mdp.scaling, names_of_robots(carried))
-    if isinstance(mdp, TeamMdp) and config and mdp.modalities == config.modalities:
-        sensors = jnp.array(config.modality_of_robot, jnp.int32)
-        return Robots(mdp, sensors, None, config.robot_names)
-    expected = "must be a task of a team alone, or a TeamMdp and the settings that it is made with"
+def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
+    """Robots of a task; or of the MDP of teams, with the settings that name them."""
+    played = mdp.mdp if isinstance(mdp, Task) else mdp
+    teams = played.teams
+    if isinstance(mdp, Task) and teams and config is None:
+        carried = tuple(mdp.modalities[int(m)] for m in played.robots)
+        return Robots(played, mdp.scaling, names_of_robots(carried))
+    if isinstance(mdp, Mdp) and teams and config and teams.modalities == config.modalities:
+        robots = jnp.array(config.modality_of_robot, jnp.int32)
+        whole = dataclasses.replace(teams, is_random=False)
+        played = dataclasses.replace(played, robots=robots, teams=whole)
+        return Robots(played, None, config.robot_names)
+    expected = "must be a task of a team alone, or an Mdp of teams and the settings it is made with"
     raise ValueError(f"mdp = {type(mdp).__name__}: {expected}")
 
 

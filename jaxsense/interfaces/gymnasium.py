@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.mdp import Mdp
 from jaxsense.interfaces import common
 from jaxsense.tasks import Environment, Task, TimeStep, registered
 from jaxsense.tasks.registry import as_task
@@ -37,7 +37,7 @@ class MapVectorEnv(VectorEnv):
 
     def __init__(
         self,
-        mdp: MapMdp | Environment,
+        mdp: Mdp | Environment,
         modality: int | None = None,
         num_envs: int = 1,
         starts: PyTree = None,

@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import PyTree
 
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn.mdp import Mdp
 from jaxsense.interfaces import common
 from jaxsense.tasks import Environment, make, registered
 
@@ -26,7 +26,7 @@ class MapEnvState(environment.EnvState):
 
     Attributes:
       time: `[]` int32 actions so far.
-      map: the state of the MDP; of a team, its `map` is that of the map.
+      map: the state of the MDP.
       terminated: `[]` bool, the last action was NOP.
     """
 
@@ -56,7 +56,7 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     the next episode. The methods are gymnax's.
     """
 
-    def __init__(self, mdp: MapMdp | Environment, modality: int | None = None):
+    def __init__(self, mdp: Mdp | Environment, modality: int | None = None):
         """Makes the environment.
 
         Args:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxsense import tasks
 from jaxsense.config import Config
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.interfaces import common
 from jaxsense.tasks.task import Task
 
@@ -37,7 +37,7 @@ class TeamEnvState(multi_agent_env.State):
       team: the state of the MDP.
     """
 
-    team: TeamState
+    team: State
 
 
 class TeamEnv(multi_agent_env.MultiAgentEnv):
@@ -48,7 +48,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     the same for all, is the duration of the step. The methods are jaxmarl's.
     """
 
-    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
+    def __init__(self, mdp: Mdp | Task, config: Config | None = None):
         """Makes the environment.
 
         Args:
@@ -67,7 +67,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     def reset(self, key: Key) -> tuple[OfRobots, TeamEnvState]:
         """Starts an episode."""
         start = self.robots.reset(key)
-        state = TeamEnvState(done=jnp.bool_(False), step=start.map.steps, team=start)  # pyright: ignore
+        state = TeamEnvState(done=jnp.bool_(False), step=start.steps, team=start)  # pyright: ignore
         return self.get_obs(state), state
 
     def step_env(  # pyright: ignore
@@ -80,14 +80,14 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         after, found, seconds = self.robots.step(key, state.team, chosen)
         dones = found.terminated | found.truncated
         ended = jnp.all(dones)
-        state = TeamEnvState(done=ended, step=after.map.steps, team=after)  # pyright: ignore
+        state = TeamEnvState(done=ended, step=after.steps, team=after)  # pyright: ignore
         infos = {"seconds": jnp.full(self.num_agents, seconds)}
         named = self.robots.named
         of_each = {**named(dones), "__all__": ended}
         return named(found.observation), state, named(found.reward), of_each, infos
 
     def get_obs(self, state: TeamEnvState) -> OfRobots:  # pyright: ignore
-        """Observation of each robot, `[S]`, see `team_mdp.observation`."""
+        """Observation of each robot, `[S]`, see `dqn.team.surroundings`."""
         return self.robots.named(self.robots.observe(state.team))
 
     @functools.partial(jax.jit, static_argnums=0)
@@ -98,9 +98,9 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     @property
     def agent_classes(self) -> dict[str, list[str]]:
         """Robots of each modality."""
-        classes: dict[str, list[str]] = {}
-        for agent, sensor in zip(self.agents, self.robots.sensors.tolist(), strict=True):
-            classes.setdefault(self.robots.mdp.modalities[sensor], []).append(agent)
+        mdp, classes = self.robots.mdp, dict[str, list[str]]()
+        for agent, sensor in zip(self.agents, mdp.robots, strict=True):
+            classes.setdefault(mdp.modalities[int(sensor)], []).append(agent)
         return classes
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxsense import tasks
 from jaxsense.config import Config
 from jaxsense.core.types import Key
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.interfaces import common
 from jaxsense.interfaces.common import Robots
 from jaxsense.tasks import Task, TimeStep
@@ -34,7 +34,7 @@ class TeamAECEnv(AECEnv):
     actions that the robot has.
     """
 
-    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
+    def __init__(self, mdp: Mdp | Task, config: Config | None = None):
         """Makes the environment; `reset` must be called before the first step.
 
         Args:
@@ -135,7 +135,7 @@ class TeamParallelEnv(conversions.turn_based_aec_to_parallel_wrapper):
     alone, and `active_agent` in the infos names it.
     """
 
-    def __init__(self, mdp: TeamMdp | Task, config: Config | None = None):
+    def __init__(self, mdp: Mdp | Task, config: Config | None = None):
         """Makes the environment, see `TeamAECEnv`."""
         super().__init__(TeamAECEnv(mdp, config))
 
@@ -151,7 +151,7 @@ def make_parallel(name: str) -> TeamParallelEnv:
 
 
 @jax.jit
-def _start(key: Key, robots: Robots) -> tuple[Key, TeamState, jax.Array, jax.Array]:
+def _start(key: Key, robots: Robots) -> tuple[Key, State, jax.Array, jax.Array]:
     """Next key, state, `[R, S]` observations and `[R, N + 1]` actions that robots have."""
     next_key, key = jax.random.split(key)
     state = robots.reset(key)
@@ -160,8 +160,8 @@ def _start(key: Key, robots: Robots) -> tuple[Key, TeamState, jax.Array, jax.Arr
 
 @jax.jit
 def _step(
-    key: Key, robots: Robots, state: TeamState, actions: jax.Array
-) -> tuple[Key, TeamState, TimeStep, jax.Array, jax.Array]:
+    key: Key, robots: Robots, state: State, actions: jax.Array
+) -> tuple[Key, State, TimeStep, jax.Array, jax.Array]:
     """Next key, state, time steps of the robots, seconds, and actions that robots have."""
     next_key, key = jax.random.split(key)
     after, found, seconds = robots.step(key, state, actions)

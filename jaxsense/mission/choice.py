@@ -14,9 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.mission import MissionConfig
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn import policies, team_mdp
+from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Known, Policy
-from jaxsense.dqn.team_mdp import Team, Travel
+from jaxsense.dqn.team import Team, Travel
 from jaxsense.models import Models
 from jaxsense.vae.novelty import Novelty
 
@@ -48,7 +48,7 @@ def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
     return Opinion(
         values=policy.values(key, models, known),
         gains=jax.vmap(of_robot)(robots) if policy.is_unordered else none,
-        counts_time=jnp.bool_(policy.counts_time(models.agent)),
+        counts_time=jnp.bool_(policy.counts_time(models)),
         is_unordered=jnp.bool_(policy.is_unordered),
     )
 
@@ -79,7 +79,7 @@ def times_to_new_looks(
         infinite for none.
     """
     metres = jax.vmap(novelty.to_go)(apart, team.modality)
-    return team_mdp.travel_times(travel, team) + metres / travel.speed
+    return travel.times(team) + metres / travel.speed
 
 
 def _by_values(known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:

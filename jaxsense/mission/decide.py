@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config.mission import MARGIN
 from jaxsense.core.types import Index, Key, call, pytree
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.team_mdp import Team, Travel
+from jaxsense.dqn.team import Team
 from jaxsense.mission import roadmap
 from jaxsense.mission.choice import ask, choose, times_to_new_looks
 from jaxsense.mission.state import (
@@ -23,7 +23,7 @@ from jaxsense.mission.state import (
     Mission,
     MissionState,
 )
-from jaxsense.models import Models
+from jaxsense.models import Models, make_travel
 from jaxsense.sim import viewpoints
 
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
@@ -140,9 +140,7 @@ def known_to(mission: Mission, models: Models, state: MissionState, robot: Index
         looks=known.times_seen,
         log_posterior=known.log_posterior,
         team=team,
-        times=times_to_new_looks(
-            Travel(mission.config.team.travel.view_distance), models.novelty, team, apart
-        ),
+        times=times_to_new_looks(make_travel(mission.config), models.novelty, team, apart),
         robot=jnp.asarray(robot),
     )
 

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxsense.core.types import Belief
-from jaxsense.dqn.map_mdp import MapMdp, MapState
-from jaxsense.dqn.team_mdp import Team, TeamState
+from jaxsense.dqn.mdp import Mdp, State
+from jaxsense.dqn.team import Team
 from jaxsense.show.colours import in_plane, modality_colour, plane
 from jaxsense.tasks import Task
 
@@ -22,7 +22,7 @@ _MARGIN = 0.8  # m, around places
 _AROUND = 0.75  # of how far classes lie apart
 
 
-def frame(task: Task, state: MapState | TeamState) -> np.ndarray:
+def frame(task: Task, state: State) -> np.ndarray:
     """What is known in a state, and the truth.
 
     Beliefs are 2-sigma ellipses in the two latent dimensions that show classes, which are numbered,
@@ -33,20 +33,18 @@ def frame(task: Task, state: MapState | TeamState) -> np.ndarray:
     Returns:
       `[H, W, 3]` uint8 sRGB.
     """
-    mdp: MapMdp = task.mdp.map
-    shown, probabilities, classes = jax.device_get(
-        (state.map.belief, *_read(mdp, state.map.belief))
-    )
+    mdp, drives = task.mdp, task.mdp.teams is not None
+    shown, probabilities, classes = jax.device_get((state.belief, *_read(mdp, state.belief)))
     colours = colormaps["tab10" if mdp.num_classes <= 10 else "tab20"](range(mdp.num_classes))
     pois = np.flatnonzero(np.asarray(task.action_mask(state))[:-1])
-    figure = Figure(figsize=(_SIZE * (2 + len(state.teams)), _SIZE), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(_SIZE * (2 + drives), _SIZE), dpi=_DPI, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 2 + len(state.teams))
-    title = f"{task.name}, {task.agent}", f"step {int(state.map.steps)} of {task.max_steps}"
-    figure.suptitle(", ".join([*title, *(f"{float(each.seconds):.1f} s" for each in state.teams)]))
+    axes = figure.subplots(1, 2 + drives)
+    title = f"{task.name}, {task.agent}", f"step {int(state.steps)} of {task.max_steps}"
+    figure.suptitle(", ".join([*title, *[f"{float(state.seconds):.1f} s"] * drives]))
     nearest = colours[np.argmax(probabilities, axis=1)]
     _draw_beliefs(axes[0], shown, classes, colours, nearest, pois)
-    truth, seen = np.asarray(state.map.classes), np.asarray(state.map.seen)
+    truth, seen = np.asarray(state.classes), np.asarray(state.seen)
     left = np.zeros(len(pois))
     for colour, of_class in zip(colours, probabilities[pois].T, strict=True):
         axes[1].barh(pois, of_class, left=left, color=colour, edgecolor="w")
@@ -58,15 +56,15 @@ def frame(task: Task, state: MapState | TeamState) -> np.ndarray:
     axes[1].set_yticks(pois, names, fontsize="small")
     axes[1].set(xlim=(0, 1), title="class probabilities")
     axes[1].invert_yaxis()
-    for each in state.teams:
-        team = jax.tree.map(np.asarray, each.team)
-        _draw_places(axes[2], team, int(each.agent), nearest, colours[truth])
+    if drives:
+        team = jax.tree.map(np.asarray, state.team)
+        _draw_places(axes[2], team, int(state.agent), nearest, colours[truth])
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 @jax.jit
-def _read(mdp: MapMdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
+def _read(mdp: Mdp, belief: Belief) -> tuple[jax.Array, jax.Array]:
     """`[N, C]` class probabilities of beliefs, and `[C, D]` means of classes."""
     probabilities = jax.vmap(mdp.fusion.class_probabilities)(belief)
     return probabilities, mdp.fusion.classes.mean

@@ -1,18 +1,13 @@
 """What a task is to those who learn in it: an MDP of one policy, as a few pure functions."""
 
-import abc
-
 import jax
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.section import require_32_bits
-from jaxsense.core.types import Belief, Key, pytree
-from jaxsense.dqn import map_mdp
-from jaxsense.dqn.map_agent import observation
-from jaxsense.dqn.map_mdp import MapMdp, MapState
-from jaxsense.dqn.team_mdp import TeamMdp
+from jaxsense.core.types import Key, pytree
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.mdp import Mdp, State
 
 CLIP = 10.0
 """Scaled observations are within plus and minus this."""
@@ -58,89 +53,58 @@ class TimeStep:
 
 
 @pytree
-class Environment(abc.ABC):
+class Environment:
     """An environment in which one policy makes all choices; a pytree.
+
+    Robots choose in turn, and each observation is what the robot knows whose turn it is.
 
     Attributes:
       bound: observations are within plus and minus this.
     """
 
-    mdp: MapMdp | TeamMdp
+    mdp: Mdp
     bound = float("inf")
 
     @property
     def num_actions(self) -> int:
-        """A: a look at each PoI, and NOP, the last, which ends the agent's work."""
-        return self.mdp.map.num_pois + 1
+        """A: a look at each PoI, and NOP, the last, which ends the robot's work."""
+        return self.mdp.num_actions
 
     @property
     def max_steps(self) -> int:
         """Actions after which an episode is truncated."""
-        return int(self.mdp.max_steps)
+        return int(self.mdp.config.max_steps)
 
     @property
     def observation_size(self) -> int:
         """S, the features of all PoIs."""
-        return self.mdp.num_features * self.mdp.map.num_pois
+        return self.mdp.num_features * self.mdp.num_pois
 
-    def reset(self, key: Key) -> tuple[Float[Array, " S"], PyTree]:
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], State]:
         """Starts an episode: the observation, and the state."""
         require_32_bits()
-        state = self.start(key)
+        state = mdps.reset(key, self.mdp)
         return self.observe(state), state
 
-    def observe(self, state: PyTree) -> Float[Array, " S"]:
+    def observe(self, state: State) -> Float[Array, " S"]:
         """What the agent sees of a state: its features."""
         return self.features(state).reshape(-1)
 
-    @abc.abstractmethod
-    def start(self, key: Key) -> PyTree:
-        """The first state of an episode."""
-
-    @abc.abstractmethod
-    def features(self, state: PyTree) -> Float[Array, "N F"]:
+    def features(self, state: State) -> Float[Array, "N F"]:
         """What an observation holds of each PoI, not yet scaled."""
+        return self.mdp.features(state.belief, state.team, state.agent)
 
-    @abc.abstractmethod
-    def action_mask(self, state: PyTree) -> Bool[Array, " A"]:
+    def action_mask(self, state: State) -> Bool[Array, " A"]:
         """The actions that exist in a state."""
+        return state.team.action_mask
 
-    @abc.abstractmethod
-    def step(self, key: Key, state: PyTree, action: Int[Array, ""]) -> tuple[PyTree, TimeStep]:
-        """The next state, and what the agent sees of it. An episode that has ended goes on."""
+    def step(self, key: Key, state: State, action: Int[Array, ""]) -> tuple[State, TimeStep]:
+        """Takes an action; a PoI that is not present counts as NOP.
 
-
-@pytree
-class OneAgent(Environment):
-    """The map MDP of one agent, see `Environment`.
-
-    Attributes:
-      modality: index of the agent's own sensor.
-    """
-
-    mdp: MapMdp
-    modality: int = struct.field(pytree_node=False)
-
-    def start(self, key: Key) -> MapState:
-        """The first state of an episode."""
-        return map_mdp.reset(key, self.mdp)
-
-    def features(self, state: MapState) -> Float[Array, "N F"]:
-        """Mean and standard deviation of each PoI's belief."""
-        return of_belief(state.belief)
-
-    def action_mask(self, state: MapState) -> Bool[Array, " A"]:
-        """All actions exist."""
-        del state
-        return jnp.ones(self.num_actions, bool)
-
-    def step(self, key: Key, state: MapState, action: Int[Array, ""]) -> tuple[MapState, TimeStep]:
-        """Takes an action, see `Environment.step`."""
-        after, outcome = map_mdp.step(key, self.mdp, state, action, self.modality)
-        seen = self.observe(after)
-        return after, TimeStep(seen, outcome.reward, outcome.terminated, outcome.truncated)
-
-
-def of_belief(belief: Belief) -> Float[Array, "N F"]:
-    """Mean and standard deviation of each PoI's belief."""
-    return observation(belief).reshape(len(belief.mean), -1)
+        Returns:
+          The next state, and what the agent sees of it. The reward is that of the look, if there
+          was one, less the price of the time of all robots. An episode that has ended goes on.
+        """
+        after, outcome = mdps.step(key, self.mdp, state, state.team.existing(action))
+        seen, reward = self.observe(after), self.mdp.earned(outcome, after.team)
+        return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)

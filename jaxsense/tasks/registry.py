@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +11,11 @@ from jaxsense import models
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.section import require_32_bits
 from jaxsense.core.types import Key
-from jaxsense.dqn.team_mdp import TeamMdp
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.environment import Scaling
 from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin, fill, read
-from jaxsense.tasks.task import MapTask, Task, TeamTask, fixed_draws, key_of_seed
+from jaxsense.tasks.task import Task, fixed_draws, key_of_seed
 from jaxsense.training.comparison import models_of
 
 TASKS = {
@@ -128,8 +126,7 @@ def _require_name(name: str, known: Iterable[str] = TASKS) -> None:
 
 def agents_of(config: Config) -> tuple[str, ...]:
     """Who acts in a task with some settings."""
-    learner = models.make_agent(config).learner
-    return tuple(dict.fromkeys(map(learner, config.modalities)))
+    return ("team",) if config.dqn.task == "team" else config.modalities
 
 
 def task_of(
@@ -142,17 +139,11 @@ def task_of(
     returns: jax.Array,
 ) -> Task:
     """The task of some settings, networks, looks and returns of the references."""
-    shared: dict[str, Any] = {
-        "models": parts,
-        "scaling": scaling,
-        "returns": returns,
-        "name": name,
-        "agent": agent,
-        "modalities": config.modalities,
-    }
     mdp = make_mdp(config, parts, looks)
-    if isinstance(mdp, TeamMdp):
+    if mdp.teams is None:
+        mdp = mdp.of(config.modalities.index(agent))
+    else:
         # A task is a whole mission.
-        whole = dataclasses.replace(mdp, partly_seen=0.0)
-        return TeamTask(mdp=whole, robots=jnp.array(config.modality_of_robot, jnp.int32), **shared)
-    return MapTask(mdp=mdp, modality=config.modalities.index(agent), **shared)
+        teams = dataclasses.replace(mdp.teams, partly_seen=0.0, is_random=False)
+        mdp = dataclasses.replace(mdp, robots=jnp.array(config.modality_of_robot), teams=teams)
+    return Task(mdp, parts, scaling, returns, name, agent, config.modalities)

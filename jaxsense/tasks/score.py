@@ -17,7 +17,8 @@ from jaxsense.config.section import require_function
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
-from jaxsense.dqn.policies import Agent, best
+from jaxsense.dqn.agent import Agent
+from jaxsense.dqn.policies import best
 from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, fixed_draws, key_of_seed
 

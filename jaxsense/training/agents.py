@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -14,29 +13,28 @@ from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitState
 from jaxsense.core.types import Belief, Fusion, Key, pytree
-from jaxsense.dqn import map_mdp, optimum, rewards, team_mdp, tours
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import optimum, rewards, tours
 from jaxsense.dqn import training as dqn
-from jaxsense.dqn.map_mdp import MapMdp, MapState
+from jaxsense.dqn.agent import Environment, Underway
+from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import auction, expected_gain
-from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import TeamMdp, TeamState
+from jaxsense.dqn.team import alone
 from jaxsense.dqn.tours import Trials
-from jaxsense.dqn.training import Environment
-from jaxsense.looks import Bank, Live
-from jaxsense.models import make_agent, make_bayes, make_prior
+from jaxsense.dqn.training import DqnState
+from jaxsense.looks import Bank, Live, make_mdp
+from jaxsense.models import make_agent, make_bayes, make_prior, orders_looks
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
-from jaxsense.training.comparison import held_out_mdp, mdp_of
+from jaxsense.training.comparison import held_out_mdp, models_of
 from jaxsense.training.detections import Detections, Starts
 from jaxsense.training.stage import Drive, Output, Progress, Stage, in_chunks
 from jaxsense.vae import readout
 from jaxsense.vae.detectors import Detector
 
 _MAX_LOOKS = 20  # at one PoI, in the values of looks
-
-State = dqn.DqnState[Output]
 
 
 def look_values(
@@ -92,7 +90,7 @@ def train(
     fusion: Output,
     detectors: tuple[Output, ...],
 ) -> dict[str, Output]:
-    """Trains the Q-networks, returned by `learner`, and the network that orders looks, if any."""
+    """Trains the Q-networks, returned by the names of their stages, and that which orders looks."""
     given = {"detections": detections, "fusion": fusion, "detectors": detectors}
     starts = drive(Stage("starts", functools.partial(_starts, arena)), **given)
     networks: dict[str, Output] = {}
@@ -109,8 +107,8 @@ def train(
                 shares="dqn",
             )
             networks[network] = drive(stage, modality=jnp.int32(m), starts=starts, **given)
-    for network in make_agent(config).tour_networks:
-        tour = _tour_stage(config, network)
+    if orders_looks(config):
+        tour = _tour_stage(config)
         drive(tour, look_values=look_values, fusion=fusion, detections=detections)
     return networks
 
@@ -123,11 +121,12 @@ def _environment(
     detections: Detections,
     fusion: Fusion,
     detectors: tuple[Detector, ...],
-) -> Environment[Output]:
+) -> Environment:
     """What an agent learns in."""
     is_live = config.dqn.observe == "live"
     looks = Live(make_world(config, arena=arena), detectors) if is_live else Bank(detections.bank)
-    return make_agent(config).environment(mdp_of(config, fusion, looks), modality)
+    mdp = make_mdp(config, models_of(config, fusion), looks)
+    return Environment(make_agent(config), mdp.of(modality) if mdp.teams is None else mdp)
 
 
 def _starts(
@@ -137,7 +136,7 @@ def _starts(
     learning = _environment(arena, config, jnp.int32(0), detections=detections, **inputs)
     if not detections.starts.classes.shape[0]:
         return dqn.starts(key, learning, config.dqn)
-    return _surveyed_starts(key, learning.mdp.map, detections.starts, config.dqn.num_starts)
+    return _surveyed_starts(key, learning, detections.starts, config.dqn.num_starts)
 
 
 def _begin(
@@ -148,7 +147,7 @@ def _begin(
     modality: Int[Array, ""],
     starts: Output,
     **inputs: Output,
-) -> State:
+) -> DqnState:
     return dqn.init(key, _environment(arena, config, modality, **inputs), config.dqn, starts)
 
 
@@ -156,14 +155,14 @@ def _advance(
     arena: Arena,
     key: Key,
     config: Config,
-    state: State,
+    state: DqnState,
     *,
     modality: Int[Array, ""],
     starts: Output,
     **inputs: Output,
-) -> tuple[State, Progress]:
-    mdp = held_out_mdp(config, inputs["fusion"], inputs["detections"])
-    evaluation = comparison.evaluation(modality, mdp, config)
+) -> tuple[DqnState, Progress]:
+    mdp = held_out_mdp(config, inputs["fusion"], inputs["detections"], modality)
+    evaluation = comparison.evaluation(mdp, config)
     learning = _environment(arena, config, modality, **inputs)
     state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluation)
     reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
@@ -172,36 +171,38 @@ def _advance(
     return state, Progress(loss, metrics)
 
 
-def _params(config: Config, state: State, **_: Output) -> Params:
+def _params(config: Config, state: DqnState, **_: Output) -> Params:
     del config
     return state.params
 
 
 def learner(config: Config, modality: str) -> str:
     """Name of the stage that trains the Q-network of a modality's robots."""
-    return f"dqn_{make_agent(config).learner(modality)}"
+    return "dqn_team" if config.dqn.task == "team" else f"dqn_{modality}"
 
 
-def _surveyed_starts(key: Key, mdp: MapMdp, starts: Starts, number: int) -> MapState:
+def _surveyed_starts(key: Key, learning: Environment, starts: Starts, number: int) -> Underway:
     """First states in surveyed scenes, `[number]`, with looks from the surveys."""
+    mdp = learning.mdp
+    team = alone(mdp.num_pois, mdp.robots[0])
 
-    def begin(key: Key, starts: Starts) -> MapState:
+    def begin(key: Key, starts: Starts) -> Underway:
         seen_key, begin_key = jax.random.split(key)
-        _, seen = map_mdp.random_start(seen_key, mdp)
-        return map_mdp.begin(begin_key, mdp, starts.scenes, starts.classes, seen, starts.features)
+        _, seen = mdps.random_start(seen_key, mdp)
+        of_survey = starts.scenes, starts.classes, seen, starts.features
+        return learning.begin(mdps.begin(begin_key, mdp, team, *of_survey))
 
     return jax.vmap(begin)(jax.random.split(key, number), starts)
 
 
-def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
+def _tour_stage(config: Config) -> Stage:
     settings = config.team.tours
     size, chunks = in_chunks(settings.steps)
     number = -(-settings.states // chunks)  # of states in each chunk, in which choices are tried
 
     def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
-        fit = supervised.start(make_agent(config).init_tours(key)[0], settings)
-        no_trials = tours.no_trials(network.features, config.team.num_pois[1], chunks * number)
-        return fit, no_trials
+        agent = make_agent(config)
+        return supervised.start(agent.init(key), settings), tours.no_trials(agent, chunks * number)
 
     def advance(
         key: Key,
@@ -216,11 +217,11 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
         fit, trials = state
         settings = config.team.tours
         try_key, draw_key = jax.random.split(key)
-        mdp = cast("TeamMdp", mdp_of(config, fusion, Bank(detections.bank)))
+        mdp = make_mdp(config, models_of(config, fusion), Bank(detections.bank))
         followed = _Auction(mdp, fusion, look_values)
         found = tours.try_choices(try_key, mdp, followed, number)
         trials = tours.write(trials, found, fit.step // size * number)
-        problem = tours.Fitting(settings, trials, network, config.jmvae.latent_size)
+        problem = tours.Fitting(settings, trials, make_agent(config))
         fit, losses = supervised.fit(draw_key, fit, problem, size)
         return (fit, trials), Progress(losses, {})
 
@@ -235,7 +236,7 @@ def _tour_stage(config: Config, network: PoolingNetwork) -> Stage:
 class _Auction:
     """The policy that robots follow in trials: an auction of gains minus the price of travel."""
 
-    mdp: TeamMdp
+    mdp: Mdp
     fusion: Fusion
     look_values: tuple[LookValues, ...]
 
@@ -243,8 +244,8 @@ class _Auction:
         """`[M]` expected reward of each modality's next look."""
         return expected_gain(self.fusion, self.look_values, belief, is_seen)
 
-    def values(self, read: Float[Array, "N M"], state: TeamState) -> Float[Array, " A"]:
+    def values(self, read: Float[Array, "N M"], state: State) -> Float[Array, " A"]:
         """`[N + 1]` values of actions."""
-        times = team_mdp.travel_times(self.mdp.travel, state.team)
-        worth = read.T[state.team.modality] - self.mdp.config.second_cost * times
+        times = self.mdp.travel.times(state.team)
+        worth = read.T[state.team.modality] - self.mdp.second_cost * times
         return auction(worth, times, state.team, state.agent)

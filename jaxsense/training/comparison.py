@@ -11,16 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Fusion, Key
+from jaxsense.core.types import Fusion, Index, Key
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.episodes import Start, reference
-from jaxsense.dqn.map_mdp import Looks, MapMdp, random_start
+from jaxsense.dqn.mdp import Mdp, random_start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Policy, Values
-from jaxsense.dqn.team_mdp import TeamMdp
-from jaxsense.looks import Bank, make_mdp
-from jaxsense.models import Models, make_agent, make_bayes, make_models
+from jaxsense.looks import Bank, mdp_of_one
+from jaxsense.models import Models, make_bayes, make_models
 from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Output
 from jaxsense.vae import novelty
@@ -56,42 +55,36 @@ def models_of(
     )
 
 
-def mdp_of(config: Config, fusion: Fusion, looks: Looks) -> MapMdp | TeamMdp:
-    """MDP in which agents learn."""
-    return make_mdp(config, models_of(config, fusion), looks)
-
-
 def held_out_mdp(
-    config: Config, fusion: Fusion, detections: Detections, num_pois: int | None = None
-) -> MapMdp:
-    """Map MDP with held-out features, in which policies are measured."""
-    mdp = mdp_of(config, fusion, Bank(detections.held_out)).map
-    number = config.arena.num_pois if num_pois is None else num_pois
-    return dataclasses.replace(mdp, num_pois=number)
+    config: Config,
+    fusion: Fusion,
+    detections: Detections,
+    modality: Index,
+    num_pois: int | None = None,
+) -> Mdp:
+    """MDP of one robot with held-out features, in which policies are measured."""
+    return mdp_of_one(config, fusion, Bank(detections.held_out), modality, num_pois)
 
 
-def evaluation(
-    modality: Int[Array, ""], mdp: MapMdp, config: Config
-) -> Callable[[Key], dqn.Evaluate]:
+def evaluation(mdp: Mdp, config: Config) -> Callable[[Key], dqn.Evaluate]:
     """The mean total reward of a Q-network's policy, in one episode from each of random starts.
 
     The first key draws the starts; the second, in each call, the looks.
     """
-    agent, exact, number = make_agent(config), make_bayes(config), config.evaluation.num_starts
+    number = config.evaluation.num_starts
 
     def prepare(key: Key) -> dqn.Evaluate:
-        reset = jax.vmap(lambda key: episodes.reset(key, mdp, exact))
+        reset = jax.vmap(lambda key: episodes.reset(key, mdp, make_bayes(config)))
         starts = reset(jax.random.split(key, number))
 
         def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-            def act(key: Key, known: Known) -> jax.Array:
-                del key
-                classes = mdp.fusion.classes
-                values = agent.decide(q_network, (), classes, known.belief, known.team, known.robot)
-                return policies.best(values)
+            models = models_of(config, mdp.fusion, (), (q_network,) * len(config.modalities))
+
+            def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+                return policies.best(policies.latent(key, models, known)), memory
 
             def episode(key: Key, start: Start) -> jax.Array:
-                return episodes.run_episode(key, mdp, exact, act, start, modality)[0]
+                return episodes.run_episode(key, mdp, models.bayes, act, start)[0]
 
             return jnp.mean(jax.vmap(episode)(jax.random.split(key, number), starts))
 
@@ -102,9 +95,8 @@ def evaluation(
 
 def compare_policies(
     key: Key,
-    modality: Int[Array, ""],
     models: Models,
-    mdp: MapMdp,
+    mdp: Mdp,
     config: Config,
     own: Mapping[str, Values | Policy] | None = None,
 ) -> Rewards:
@@ -112,8 +104,7 @@ def compare_policies(
 
     Args:
       key: random key.
-      modality: index of the agent's own sensor.
-      models: whose `q_networks` are all of this modality.
+      models: whose `q_networks` are all of the robot's modality.
       mdp: from `held_out_mdp`.
       config: all settings.
       own: custom policies by name.
@@ -125,9 +116,9 @@ def compare_policies(
     settings = config.evaluation
     start_key, table_key, play_key = jax.random.split(key, 3)
     starts = _every_start(start_key, mdp, config)
-    optimal = reference(table_key, mdp, modality, models, models.bayes.labels)
+    optimal = reference(table_key, mdp, models, models.bayes.labels)
     table, names = policies.table(own), (*COMPARED, *(own or {}))
-    looks = jnp.sum(starts[1][..., modality], axis=-1)
+    looks = jnp.sum(starts[1][..., mdp.robots[0]], axis=-1)
     often, seldom = settings.num_repeats, -(-settings.num_repeats // 8)
     numbers = jnp.stack([often if name in _STATE_BY_STATE else seldom for name in names])
 
@@ -136,7 +127,7 @@ def compare_policies(
         return episode_key, episodes.reset(reset_key, mdp, models.bayes, classes, seen)
 
     def episode(which: Int[Array, ""], key: Key, start: Start) -> tuple[jax.Array, jax.Array]:
-        def act(key: Key, known: Known) -> jax.Array:
+        def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
             of_each = [
                 functools.partial(optimal, known, start.state.classes)
                 if name == "optimal"
@@ -144,9 +135,9 @@ def compare_policies(
                 for name in names
             ]
             # By a switch, so that one program is compiled for all policies.
-            return policies.best(jax.lax.switch(which, of_each))
+            return policies.best(jax.lax.switch(which, of_each)), memory
 
-        return episodes.run_episode(key, mdp, models.bayes, act, start, modality)
+        return episodes.run_episode(key, mdp, models.bayes, act, start)
 
     def repeat(i: jax.Array, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         keys = jax.random.split(jax.random.fold_in(play_key, i), len(starts[0]))
@@ -190,7 +181,7 @@ def _in_groups(
 
 
 def _every_start(
-    key: Key, mdp: MapMdp, config: Config
+    key: Key, mdp: Mdp, config: Config
 ) -> tuple[Int[Array, "S N"], Bool[Array, "S N M"]]:
     """Classes and looks of every state of the map, then of random starts."""
     keys = jax.random.split(key, config.evaluation.num_starts)
@@ -231,8 +222,8 @@ def play_policies(
     """Runs `compare_policies` for one modality; with as many PoIs as in the arena by default."""
     q_networks = (q_network,) * len(config.modalities)
     models = models_of(config, fusion, look_values, q_networks)
-    mdp = held_out_mdp(config, fusion, detections, num_pois)
-    return compare_policies(key, modality, models, mdp, config)
+    mdp = held_out_mdp(config, fusion, detections, modality, num_pois)
+    return compare_policies(key, models, mdp, config)
 
 
 def play_numbers(key: Key, config: Config, **inputs: Output) -> list[Rewards]:

@@ -46,10 +46,9 @@ class World:
         self.in_place = self.models.fusion
         self.bank = tuple(jnp.full((3, 4, 2), 0.5) for _ in range(2))
         self.mdp = jaxsense.make_mdp(SMOKE, self.models, jaxsense.Bank(self.bank))
-        self.environment = self.models.agent.environment(self.mdp, 0)
-        beliefs = Belief(jnp.zeros((3, 2)), jnp.ones((3, 2)))
+        self.environment = dqn.Environment(self.models.agent, self.mdp)
         seen = jnp.zeros((3, 2), bool)
-        self.state = dqn.MapState(beliefs, seen, self.classes, self.classes, jnp.int32(0))
+        self.state = jax.jit(dqn.reset)(self.key, self.mdp, self.classes, seen)
         self.belief, self.means = Belief(jnp.zeros(2), jnp.ones(2)), jnp.zeros((3, 2))
         self.seen, self.x = jnp.zeros(2, bool), jnp.zeros(2)
         self.look = jnp.array([0.75, 0.25])
@@ -140,7 +139,7 @@ FUNCTIONS = {
     ),
     "task step team": (
         lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0),
-        ": must be TeamState, as from reset",
+        "state.seen has the shape (3, 2): must be (8, 2)",
     ),
     "make_mdp few": (
         lambda w: jaxsense.make_mdp(SMOKE, w.models, jaxsense.Bank(w.bank[:1])),
@@ -236,7 +235,7 @@ FUNCTIONS = {
     "information zero": (lambda w: information(w.x), "std = 0.0: must be greater than 0"),
     "reset classes": (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
     "step action": (
-        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4), 0),
+        lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4)),
         "action = 4: must be a whole number from 0 to 3",
     ),
     "mission.rollout": (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),

@@ -8,8 +8,8 @@ import pytest
 from benchmarks.dqn import untrained_task
 from benchmarks.peers.numpy_mdp import NumpyMdp
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import map_mdp
-from jaxsense.dqn.map_agent import observation
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.agent import observation
 
 TOLERANCE = 1e-5  # latent units, over a few float32 layers
 
@@ -24,8 +24,8 @@ def task():
 @pytest.mark.parametrize("modality", [0, 1])
 def test_every_step_equals_ours(task, modality):
     mdp = task.mdp
-    step = jax.jit(lambda key, state, a: map_mdp.step(key, mdp, state, a, modality))
-    reset = jax.jit(lambda key, classes, seen: map_mdp.reset(key, mdp, classes, seen))
+    step = jax.jit(lambda key, state, a: mdps.step(key, mdp.of(modality), state, a))
+    reset = jax.jit(lambda key, classes, seen: mdps.reset(key, mdp, classes, seen))
     observed = jax.jit(observation)
     theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, modality)
     rng = np.random.default_rng(0)

@@ -8,11 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import ONCE_Q, ONCE_SEEN, paying_once_mdp
+from toys import ONCE_Q, ONCE_SEEN, agent_of, paying_once_mdp
 
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import map_mdp, replay, team_mdp, training
-from jaxsense.dqn.map_agent import MapAgent
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import replay, training
+from jaxsense.dqn.agent import Environment
+from jaxsense.dqn.team import alone
 
 # Every episode is cut after one action: no value could be learnt beyond it, were a cut an end.
 MDP = paying_once_mdp(num_pois=2, max_steps=1)
@@ -32,7 +34,7 @@ PROBE = DqnConfig(
 
 def learning_in(mdp, config):
     """What an agent with the only sensor learns in."""
-    return MapAgent(config.discount, mdp.num_pois, 2, config.hidden).environment(mdp, 0)
+    return Environment(agent_of(mdp, config.hidden, config.discount), mdp)
 
 
 SMALL = DqnConfig(
@@ -53,7 +55,7 @@ LEARNING = learning_in(MDP, SMALL)
 
 def states():
     classes = jnp.zeros(2, int)
-    reset = lambda seen: map_mdp.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
+    reset = lambda seen: mdps.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
     return jax.jit(jax.vmap(reset))(ONCE_SEEN)
 
 
@@ -61,8 +63,7 @@ def states():
 def values(params):
     """`[4, 3]` values in the states above."""
     agent = learning_in(MDP, PROBE).agent
-    alone = team_mdp.alone(2, 0)
-    observed = jax.vmap(lambda b: agent.observe(b, alone, jnp.int32(0)))(states().belief)
+    observed = jax.vmap(lambda b: agent.observe(b, alone(2, 0), jnp.int32(0)))(states().belief)
     return agent.values(params, observed.T).T
 
 
@@ -189,7 +190,7 @@ def test_an_episode_goes_on_until_nop_or_the_cut(monkeypatch):
     np.testing.assert_allclose(ended, -1.2 - 1.8 * seen_before / 4, atol=1e-5)
     np.testing.assert_array_equal(np.asarray(info.episode_return)[[0, 1, 3, 4, 6]], 0.0)
     np.testing.assert_array_equal(state.done, False)
-    np.testing.assert_array_equal(state.envs.steps, 1)
+    np.testing.assert_array_equal(state.envs.now.steps, 1)
     # A cut is no end, so the discount is that of the settings and never 0 here.
     drawn = replay.sample(jax.random.uniform(jax.random.key(3), (64, 2)), state.replay)
     np.testing.assert_array_equal(drawn.discount_t, config.discount)
@@ -215,8 +216,8 @@ def test_values_after_an_action_are_those_of_the_target_network(monkeypatch):
 
     @jax.jit
     def begin():
-        one = map_mdp.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
-        prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), one)
+        one = mdps.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
+        prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), learning.begin(one))
         return prepared, training.init(jax.random.key(0), learning, config, prepared)
 
     prepared, state = begin()

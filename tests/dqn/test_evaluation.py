@@ -25,13 +25,18 @@ def always(act):
     return lambda seen: act
 
 
+def forgetting(act):
+    """The policy as one with a memory, in which it writes nothing."""
+    return lambda key, known, memory: (act(key, known), memory)
+
+
 def start(mdp, seen):
     return episodes.reset(KEY, mdp, Ignorant(), jnp.array([0, 1, 2]), jnp.array(seen, bool))
 
 
 def play(mdp, act, seen, modality=0):
-    begun = start(mdp, seen)
-    return episodes.run_episode(KEY, mdp, Ignorant(), act(seen), begun, modality)
+    own, begun = mdp.of(modality), start(mdp, seen)
+    return episodes.run_episode(KEY, own, Ignorant(), forgetting(act(seen)), begun)
 
 
 def test_the_states_of_the_paper_are_those_whose_classes_differ():
@@ -134,7 +139,8 @@ def test_policies_know_looks_and_the_exact_posterior(modality):
         return jnp.array([2, 1, 2, NOP])[jnp.sum(known.looks) - first]
 
     begun = episodes.reset(KEY, MDP, OfLooks(), jnp.array([0, 1, 2]), jnp.array(seen, bool))
-    jax.block_until_ready(episodes.run_episode(KEY, MDP, OfLooks(), act, begun, modality))
+    found = episodes.run_episode(KEY, MDP.of(modality), OfLooks(), forgetting(act), begun)
+    jax.block_until_ready(found)
     factors = np.array([0.0, 11.0, 20.0])
     for action, (looks, posterior) in zip((2, 1, 2, None), told, strict=True):
         np.testing.assert_array_equal(looks, seen)

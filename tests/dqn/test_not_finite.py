@@ -6,25 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Certain, Ignorant, Toy, classes_mdp, paying_once_mdp, policy
+from toys import Certain, Ignorant, Toy, agent_of, classes_mdp, paying_once_mdp, policy
 
 from jaxsense.config import DqnConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import episodes, map_mdp, training
-from jaxsense.dqn.map_agent import MapAgent
+from jaxsense.dqn import episodes, training
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.agent import Environment
 
 MDP, NOP, KEY = classes_mdp(), 3, jax.random.key(0)
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def start(mdp=MDP):
-    return map_mdp.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
+    return mdps.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
 
 
 @pytest.mark.parametrize("action", [-1, NOP + 1])
 def test_an_action_that_is_none_pays_nan(action):
     # Traced, it cannot be refused; known before, it is.
-    step = jax.jit(lambda action: map_mdp.step(KEY, MDP, start(), action, 0)[1])
+    step = jax.jit(lambda action: mdps.step(KEY, MDP.of(0), start(), action)[1])
     outcome = step(jnp.int32(action))
     assert np.isnan(outcome.reward)
     assert not outcome.terminated
@@ -32,20 +33,20 @@ def test_an_action_that_is_none_pays_nan(action):
 
 @pytest.mark.parametrize("worst", [0, 2, 3])
 def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
-    agent = MapAgent(0.5, 3, 2, (4,))
+    agent = agent_of(MDP, (4,))
     params = agent.init(KEY)["params"]
     bias = jnp.array([0.0, 1.0, 2.0, 9.0]).at[worst].set(jnp.nan)
     layers = {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}
-    latent = policy("latent", agent=agent, q_networks=(layers,) * 2, tours=None, fusion=MDP.fusion)
+    latent = policy("latent", agent=agent, q_networks=(layers,) * 2, tours=(), fusion=MDP.fusion)
     told = []
 
-    def act(key, known):
+    def act(key, known, memory):
         action = latent(key, known)
         jax.debug.callback(told.append, action)
-        return action
+        return action, memory
 
     begun = episodes.reset(KEY, MDP, Ignorant())
-    total, first = episodes.run_episode(KEY, MDP, Ignorant(), act, begun, 0)
+    total, first = episodes.run_episode(KEY, MDP, Ignorant(), act, begun)
     assert np.isnan(total)
     assert np.isnan(first)
     jax.effects_barrier()
@@ -84,7 +85,7 @@ class Wide(Toy):
 
 PAYING = paying_once_mdp()
 SCENE_MDP = replace(PAYING, looks=Shown(1), fusion=Wide(PAYING.fusion.prior, 1))
-SCENE = MapAgent(CONFIG.discount, 2, 2, CONFIG.hidden).environment(SCENE_MDP, 0)
+SCENE = Environment(agent_of(SCENE_MDP, CONFIG.hidden), SCENE_MDP)
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +121,8 @@ def test_one_parameter_that_is_not_finite_is_told_at_once(chunk):
 
 def test_one_reward_that_is_not_a_number_is_told_before_it_is_learnt_from(chunk):
     run, state, prepared = chunk
-    _, info = run(
-        with_memories(state), replace(prepared, scene=jnp.full_like(prepared.scene, jnp.nan))
-    )
+    scene = jnp.full_like(prepared.now.scene, jnp.nan)
+    now = replace(prepared.now, scene=scene)
+    _, info = run(with_memories(state), replace(prepared, now=now))
     assert np.isfinite(info.loss).all()
     np.testing.assert_array_equal(info.is_finite, [False, False])

@@ -8,10 +8,11 @@ from toys import known_of, policy
 
 from jaxsense.config import ConfigError
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import map_agent, optimum, policies
+from jaxsense.dqn import hybrid, optimum, policies
+from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Policy
-from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn.team import Team
 
 NOP, KEY, UNKNOWN = 3, jax.random.key(0), np.zeros((3, 3))
 # The logarithm of what is not so.
@@ -90,7 +91,7 @@ def test_random_takes_every_action_equally_often():
 
 
 def test_latent_takes_the_action_that_the_own_q_network_values_most():
-    agent = map_agent.MapAgent(0.5, 3, 2, (4,))
+    agent = Agent(0.5, 0.0, 0.0, None, 3, 2, 2, (4,))
     layers = agent.init(KEY)["params"]
 
     def biased(best):
@@ -102,14 +103,14 @@ def test_latent_takes_the_action_that_the_own_q_network_values_most():
 
     for best in range(4):
         networks = biased(best), biased((best + 1) % 4)
-        models = {"agent": agent, "q_networks": networks, "tours": None, "fusion": Classes}
+        models = {"agent": agent, "q_networks": networks, "tours": (), "fusion": Classes}
         for modality in (0, 1):
             known = known_of(UNKNOWN, np.zeros((3, 2)), modality)
             assert policy("latent", **models)(KEY, known) == (best + modality) % 4
 
 
 @pytree
-class Widths(map_agent.MapAgent):
+class Widths(Agent):
     """Values of looks at all PoIs are the sum of all widths, and that of NOP is 1."""
 
     def values(self, params, observed):
@@ -118,16 +119,16 @@ class Widths(map_agent.MapAgent):
 
 
 def test_a_look_is_worth_what_it_is_worth_alone():
-    agent = Widths(0.5, 3, 1, (4,))
+    agent = Widths(0.5, 0.0, 0.0, None, 3, 2, 1, (4,))
     belief = Belief(jnp.zeros((3, 1)), jnp.array([[2.0], [4.0], [8.0]]))
     # Classes of widths .25 and .75: each of the other two PoIs counts .5.
     classes = Belief(jnp.zeros((2, 1)), jnp.array([[0.25], [0.75]]))
-    team = known_of(UNKNOWN, np.zeros((3, 2))).team
-    found = agent.worth(None, classes, belief, team, jnp.int32(0))
+    known = known_of(UNKNOWN, np.zeros((3, 2)), belief=belief)
+    found = hybrid.worth(agent, None, classes, known)
     np.testing.assert_allclose(found, [2 + 1 - 1, 4 + 1 - 1, 8 + 1 - 1])
     # One that was given up is never worth a look.
-    there = team.replace(present=jnp.array([True, False, True]))
-    found = agent.worth(None, classes, belief, there, jnp.int32(0))
+    there = known.team.replace(present=jnp.array([True, False, True]))
+    found = hybrid.worth(agent, None, classes, known.replace(team=there))
     np.testing.assert_allclose(found, [2, -np.inf, 8])
 
 
@@ -135,7 +136,7 @@ def test_a_policy_of_ones_own_is_one_more_entry():
     def backwards(key, models, known):
         return jnp.append(jnp.arange(len(known.looks)), -1)
 
-    timed = Policy(backwards, lambda agent: True)
+    timed = Policy(backwards, lambda models: True)
     table = policies.table({"backwards": backwards, "timed": timed})
     assert [*table] == [*policies.POLICIES, "backwards", "timed"]
     known = known_of(UNKNOWN, np.zeros((3, 2)))

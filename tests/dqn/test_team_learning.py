@@ -10,16 +10,19 @@ from toys import (
     ONCE_Q,
     ONCE_SEEN,
     PLACES,
+    TRAVEL,
     Fixed,
+    agent_of,
     classes_mdp,
     paying_once_mdp,
     team_mdp_of,
 )
 
 from jaxsense.config import DqnConfig
-from jaxsense.config.learning import TeamConfig
-from jaxsense.dqn import map_mdp, team_mdp, training
-from jaxsense.dqn.team_agent import TeamAgent
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import training
+from jaxsense.dqn.agent import Agent, Environment
+from jaxsense.dqn.team import alone
 
 FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 SMALL = DqnConfig(
@@ -33,10 +36,7 @@ def team_of(mapped, poses, places, **config):
 
 
 def learning_in(mdp, config=SMALL):
-    agent = TeamAgent(
-        mdp.config, config.discount, -1.0, 2, mdp.map.num_modalities, config.hidden, True
-    )
-    return agent.environment(mdp, 0)
+    return Environment(agent_of(mdp, config.hidden, config.discount), mdp)
 
 
 # From the origin 6, 11 and 16 s to look, less the turns, see `test_travel.py`.
@@ -52,8 +52,8 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     # D = 1 and M = 1: nine numbers of each PoI, the third of which is its time in tens of seconds.
     seen = jnp.zeros((9, 3)).at[2].set(jnp.array([0.2, 0.0, 0.4])).reshape(-1)
     after = jnp.array([8.0, 3.0, 16.0, 0.0])
-    monkeypatch.setattr(TeamAgent, "q", lambda agent, params, observed: params)
-    agent = TeamAgent(TeamConfig(second_cost=0.1), 0.5, -1.0, 1, 1, (8,), True)
+    monkeypatch.setattr(Agent, "q", lambda agent, params, observed: params)
+    agent = Agent(0.5, 0.1, -1.0, TRAVEL, 3, 1, 1, (8,))
     # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
     np.testing.assert_allclose(agent.values(after, seen), [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
     # The same for a batch in the last axis.
@@ -67,7 +67,7 @@ AGENT = learning_in(TWO).agent
 def latent(params):
     """The policy of the trained network alone, if every look pays."""
     agent = replace(AGENT, useless=1e3)
-    models = {"agent": agent, "q_networks": (params,) * 2, "tours": None, "fusion": TWO.map.fusion}
+    models = {"agent": agent, "q_networks": (params,) * 2, "tours": (), "fusion": TWO.fusion}
     return jax.jit(policy("latent", **models))
 
 
@@ -90,7 +90,7 @@ def test_a_look_is_learned_from_when_its_robot_set_out(steps):
     agents, seen, transitions, outcomes, after = zip(*steps, strict=True)
     assert agents == (0, 1, 0, 1)
     # No look, that of robot 0 at PoI 0, that of robot 1 at PoI 1, and none.
-    assert [int(t.a_tm1) for t in transitions] == [-1, 0, 1, -1]
+    assert [int(t.a_tm1) for t in transitions] == [3, 0, 1, 3]
     assert [float(t.discount_t) for t in transitions] == [0, 1, 1, 0]
     gain = 0.2 - 1 / np.sqrt(40)
     np.testing.assert_allclose([t.r_t for t in transitions], [0, gain, gain, 0], atol=1e-6)
@@ -104,10 +104,13 @@ def test_a_look_is_learned_from_when_its_robot_set_out(steps):
 
 def test_without_a_look_nothing_is_lost(steps):
     for _, _, t, _, _ in (steps[0], steps[3]):
-        q_tm1, q_t = jnp.arange(4.0), jnp.full(4, 9.0)
-        assert training.td_error(q_tm1, t.a_tm1, t.r_t, t.discount_t, q_t) == 0
-    slope = jax.grad(lambda q: training.td_error(q, t.a_tm1, t.r_t, t.discount_t, q_t))(q_tm1)
-    np.testing.assert_array_equal(slope, 0.0)
+        # The network knows that nothing follows NOP.
+        q_tm1, q_t = jnp.array([1.0, 2.0, 3.0, 0.0]), jnp.full(4, 9.0)
+        found = t.a_tm1, t.r_t, t.discount_t, q_t
+        error = lambda q, found=found: training.td_error(q, *found)  # noqa: E731
+        assert error(q_tm1) == 0
+        slope = jax.grad(lambda q: training.pseudo_huber(error(q)))(q_tm1)  # noqa: B023
+        np.testing.assert_array_equal(slope, 0.0)
 
 
 def test_exploring_takes_every_poi_that_is_present_and_no_other():
@@ -150,9 +153,9 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
     @jax.jit
     @jax.vmap
     def learned(seen):
-        known = map_mdp.reset(jax.random.key(0), ALONE.map, jnp.zeros(2, int), seen).belief
+        known = mdps.reset(jax.random.key(0), ALONE, jnp.zeros(2, int), seen).belief
         agent = learning_in(ALONE, PROBE).agent
-        x = agent.observe(known, team_mdp.alone(2, 0), jnp.int32(0))
+        x = agent.observe(known, alone(2, 0), jnp.int32(0))
         return agent.q(state.params, x)
 
     np.testing.assert_allclose(learned(ONCE_SEEN), ONCE_Q, atol=0.1)

@@ -12,9 +12,9 @@ from toys import PLACES, TRAVEL
 
 from jaxsense.core import networks
 from jaxsense.core.types import Belief
-from jaxsense.dqn import pooling, team_mdp
+from jaxsense.dqn import pooling
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn.team import Team, num_features, own_seconds, surroundings
 
 NOP, CAMERA, LIDAR = 3, 0, 1
 BELIEF = Belief(jnp.array([[3.0], [-1.0], [0.5]]), jnp.array([[0.3], [2.0], [1.0]]))
@@ -33,9 +33,7 @@ def team_of_three(**changed):
     return replace(team, **changed)
 
 
-observe = jax.jit(
-    lambda team, agent, belief=BELIEF: team_mdp.observation(TRAVEL, belief, team, agent, 2)
-)
+observe = jax.jit(lambda team, agent, belief=BELIEF: surroundings(TRAVEL, belief, team, agent, 2))
 
 
 def test_what_a_robot_knows_as_worked_by_hand():
@@ -58,9 +56,9 @@ def test_what_a_robot_knows_as_worked_by_hand():
         *np.asarray(PLACES).T,
     ]
     found = observe(team_of_three(), jnp.int32(0))
-    assert found.shape == (team_mdp.num_features(1, 2), 3)
+    assert found.shape == (num_features(1, 2), 3)
     np.testing.assert_allclose(found, np.array(expected), atol=1e-5)
-    np.testing.assert_allclose(team_mdp.own_seconds(found, 1), 10 * camera, rtol=1e-5)
+    np.testing.assert_allclose(own_seconds(found, 1), 10 * camera, rtol=1e-5)
     # For the LiDAR the camera is the other one; it heads for PoI 2 now.
     heading = team_of_three(target=jnp.array([2, 1, 0]))
     found = observe(heading, jnp.int32(1))
@@ -93,7 +91,7 @@ def test_of_an_absent_poi_nothing_is_known():
     np.testing.assert_array_equal(found[:, [0, 2]], whole[:, [0, 2]])
 
 
-FEATURES = team_mdp.num_features(2, 2)
+FEATURES = num_features(2, 2)
 NETWORK = PoolingNetwork((6, 8), FEATURES)
 PARAMS = networks.init(jax.random.key(0), NETWORK, 3 * FEATURES)
 apply = jax.jit(lambda x: networks.apply(NETWORK, PARAMS, x.reshape(-1, *x.shape[2:])))

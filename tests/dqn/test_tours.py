@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from toys import Fixed, classes_mdp, team_mdp_of
 
-from jaxsense.config.learning import TeamConfig, ToursConfig
+from jaxsense.config.learning import ToursConfig
 from jaxsense.core import networks, supervised
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import team_mdp, tours
-from jaxsense.dqn.team_agent import TeamAgent
-from jaxsense.dqn.team_mdp import Team, Travel
+from jaxsense.dqn import hybrid, tours
+from jaxsense.dqn.agent import Agent
+from jaxsense.dqn.team import Known, Team, Travel
 from jaxsense.dqn.tours import Trials
 
 TRAVEL = Travel(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
@@ -25,12 +25,14 @@ PLACES = jnp.array([[1.9, 0.0], [3.9, 0.0], [9.0, 9.0]])
 IN_ORDER = (5 + 1) + (10 + 1)
 # 3 m to the second, a half turn and .2 m back to the first.
 BACKWARDS = (15 + 1) + (math.pi + 1 + 1)
-AGENT = TeamAgent(TeamConfig(), 0.5, -1.0, 2, 2, (8,), True)
+AGENT = Agent(0.5, 0.0, -1.0, Travel(0.96), 3, 2, 2, (8,))
 NETWORK = AGENT.network
 CLASSES = Belief(np.float32([[1.0, 0.0], [-1.0, 0.5]]), np.full((2, 2), 0.2, np.float32))
-AT_ORIGIN = {
-    "belief": Belief(np.zeros((3, 2), np.float32), np.ones((3, 2), np.float32)),
-    "team": Team(
+AT_ORIGIN = Known(
+    belief=Belief(np.zeros((3, 2), np.float32), np.ones((3, 2), np.float32)),
+    looks=np.zeros((3, 2), np.int32),
+    log_posterior=np.zeros((3, 2), np.float32),
+    team=Team(
         positions=PLACES,
         present=np.ones(3, bool),
         poses=np.zeros((2, 3), np.float32),
@@ -38,8 +40,9 @@ AT_ORIGIN = {
         works=np.ones(2, bool),
         target=np.full(2, 3),
     ),
-    "robot": np.int32(0),
-}
+    times=np.ones((2, 3), np.float32),
+    robot=np.int32(0),
+)
 
 
 def make_mdp(present=2, max_steps=300):
@@ -66,9 +69,9 @@ class InOrder:
 
     def values(self, read, state):
         # What has been read is what is on the map now.
-        belief, is_seen = state.map.belief, jnp.any(state.map.seen, axis=-1)
+        belief, is_seen = state.belief, jnp.any(state.seen, axis=-1)
         is_right = jnp.array_equal(read, jax.vmap(self.read)(belief, is_seen))
-        own = state.map.seen[:, state.team.modality[state.agent]]
+        own = state.seen[:, state.team.modality[state.agent]]
         of_pois = jnp.where(own | ~state.team.present, -1.0, 3.0 - jnp.arange(3))
         return jnp.append(of_pois + self.bonus, 0.0) + jnp.where(is_right, 0.0, jnp.nan)
 
@@ -83,11 +86,11 @@ def _trials(present, max_steps, walk, bonus):
 
 
 def fitting(trials, **config):
-    return tours.Fitting(ToursConfig(**config), trials, NETWORK, 2)
+    return tours.Fitting(ToursConfig(**config), trials, AGENT)
 
 
 def own_seconds(trials):
-    return team_mdp.own_seconds(trials.observation.reshape(NETWORK.features, 3, 64), 2)
+    return AGENT.seconds(trials.observation)
 
 
 def test_seconds_until_all_are_done_as_worked_by_hand():
@@ -127,7 +130,7 @@ def test_training_finds_the_shorter_tour():
     fit = jax.jit(lambda state: supervised.fit(jax.random.key(2), state, problem, 100))
     state, losses = fit(state)
     assert losses[-1] < 1e-3 < losses[0]
-    learned = jax.jit(lambda x: tours.seconds(NETWORK, state.params, x, 2))(trials.observation)
+    learned = jax.jit(lambda x: tours.seconds(AGENT, state.params, x))(trials.observation)
     expected = (BACKWARDS - IN_ORDER) / 2
     np.testing.assert_allclose(learned[1] - learned[0], expected, atol=0.2)
 
@@ -161,7 +164,7 @@ def replace_q(monkeypatch, q):
         mixed = [rest.at[:, i].set(x[:, i]).reshape(-1) for i in range(3)]
         return jnp.stack([*(q(self, params, x)[i] for i, x in enumerate(mixed)), 0.0])
 
-    monkeypatch.setattr(TeamAgent, "q", of_all)
+    monkeypatch.setattr(Agent, "q", of_all)
 
 
 def decided(monkeypatch, after, cost):
@@ -176,8 +179,8 @@ def decided(monkeypatch, after, cost):
 
     replace_q(monkeypatch, q)
     monkeypatch.setattr(tours, "seconds", lambda *known: jnp.array([20.0, 30.0, 10.0]))
-    agent = replace(AGENT, config=TeamConfig(second_cost=cost))
-    return jax.jit(lambda: agent.decide({}, ({},), classes=CLASSES, **AT_ORIGIN))()
+    agent = replace(AGENT, second_cost=cost)
+    return jax.jit(lambda: hybrid.decide(agent, {}, ({},), CLASSES, AT_ORIGIN))()
 
 
 def of_sigmas(monkeypatch, after):
@@ -194,7 +197,7 @@ def of_sigmas(monkeypatch, after):
 
 def test_without_tours_the_values_are_those_of_setting_out(monkeypatch):
     of_sigmas(monkeypatch, [8.0, 3.0, 16.0])
-    values = jax.jit(lambda: AGENT.decide({}, (), classes=CLASSES, **AT_ORIGIN))()
+    values = jax.jit(lambda: hybrid.decide(AGENT, {}, (), CLASSES, AT_ORIGIN))()
     # .94 m, 2.94 m and, an eighth of a turn away, 11.77 m at .2 m/s, and looks of .7 s. Each second
     # halves a value.
     seconds = np.array([5.4, 15.4, math.pi / 4 / 1.2 + (9 * math.sqrt(2) - 0.96) / 0.2 + 0.7])

@@ -1,5 +1,6 @@
-"""Map MDPs without networks, whose rewards are known: toy looks and toy fusions."""
+"""MDPs without networks, whose rewards are known: toy looks and toy fusions."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -10,10 +11,11 @@ from flax import struct
 from jaxsense.config import MdpConfig
 from jaxsense.config.learning import TeamConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import policies, rewards, team_mdp
-from jaxsense.dqn.map_mdp import MapMdp
+from jaxsense.dqn import policies, rewards
+from jaxsense.dqn.agent import Agent
+from jaxsense.dqn.mdp import Mdp
 from jaxsense.dqn.policies import Known
-from jaxsense.dqn.team_mdp import TeamMdp, Travel
+from jaxsense.dqn.team import Teams, Travel, alone
 
 SENSORS = ("camera", "lidar")
 TRAVEL = Travel(speed=0.2, turn_rate=1.0, view_distance=0.9, look_seconds=1.0)
@@ -105,7 +107,7 @@ def known_of(log_posterior, looks, modality=0, belief=None):
     """What a robot alone knows of PoIs, by `[N, C]` logarithms of posteriors and `[N, M]` looks."""
     log_posterior, looks = jnp.asarray(log_posterior), jnp.asarray(looks, jnp.int32)
     number = len(looks)
-    team = team_mdp.alone(number, modality)
+    team = alone(number, modality)
     belief = Belief(*jnp.ones((2, number, 2))) if belief is None else belief
     return Known(belief, looks, log_posterior, team, jnp.ones((1, number)), jnp.int32(0))
 
@@ -118,7 +120,7 @@ def policy(name, **models):
 
 def make_mdp(looks, fusion, num_pois, **config):
     settings = MdpConfig(**config)
-    return MapMdp(looks, fusion, rewards.make(settings), settings, num_pois)
+    return Mdp(looks, fusion, rewards.make(settings), settings, num_pois, (0,))
 
 
 def classes_mdp(num_pois=3, num_modalities=2, **config):
@@ -133,11 +135,23 @@ def classes_mdp(num_pois=3, num_modalities=2, **config):
     return make_mdp(Certain(num_modalities), Counting(prior, 3), num_pois, **given)
 
 
-def team_mdp_of(mapped, places, travel=TRAVEL, robots_each=1, **given):
-    """A team's MDP; what is given are fields of it or of its settings."""
+def agent_of(mdp, hidden, discount=0.5, second_cost=0.0):
+    """An agent of an MDP, for which a look that tells nothing costs 1."""
+    travel = None if mdp.teams is None else mdp.teams.travel
+    sizes = mdp.num_pois, mdp.num_modalities, mdp.fusion.prior.mean.size
+    return Agent(discount, second_cost, -1.0, travel, *sizes, hidden)
+
+
+def team_mdp_of(mapped, places, travel=TRAVEL, robots=None, max_steps=300, **given):
+    """An MDP of random teams on a map; what is given are fields of `Teams` or of its settings."""
     names = {name: given.pop(name) for name in ("num_pois", "second_cost") if name in given}
-    config = TeamConfig(**names)
-    return TeamMdp(config, mapped, places, SENSORS, travel, robots_each=robots_each, **given)
+    sensors = SENSORS[: mapped.num_modalities]
+    return dataclasses.replace(
+        mapped,
+        config=dataclasses.replace(mapped.config, max_steps=max_steps),
+        robots=jnp.arange(len(sensors)) if robots is None else robots,
+        teams=Teams(TeamConfig(**names), travel, places, sensors, **given),
+    )
 
 
 def noisy_mdp(num_pois=3, max_steps=20):

@@ -17,7 +17,8 @@ from jaxsense.config.mission import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.dqn.team_mdp import Team
+from jaxsense.dqn import policies
+from jaxsense.dqn.team import Known, Team
 from jaxsense.interfaces.robot import load
 from jaxsense.mission.maps import MOST_LOOKS, OwnMap, empty
 from jaxsense.vae import readout
@@ -56,15 +57,15 @@ def test_a_team_may_have_any_number_of_points_and_robots(team, example):
         given |= {"looked_from": np.full_like(given["looked_from"], np.inf)}
         given |= {"works": np.ones(robots, bool), "target": np.full(robots, pois, np.int32)}
         found = programs["decide"](**given)
-        of_team = Team(**{key: jnp.asarray(given[key]) for key in Team.__dataclass_fields__})
-        expected = trained.agent.decide(
-            trained.q_networks[given["modality"][given["robot"]]],
-            trained.tours,
-            trained.fusion.classes,
-            Belief(given["mean"], given["std"]),
-            of_team,
-            given["robot"],
+        known = Known(
+            belief=Belief(given["mean"], given["std"]),
+            looks=jnp.zeros((pois, 2), jnp.int32),
+            log_posterior=jnp.zeros((pois, 3)),
+            team=Team(**{key: jnp.asarray(given[key]) for key in Team.__dataclass_fields__}),
+            times=jnp.ones((robots, pois)),
+            robot=given["robot"],
         )
+        expected = policies.latent(None, trained, known)
         np.testing.assert_allclose(found["values"], expected, rtol=1e-4)
         # Values count travel time: the best is taken.
         assert found["action"] == np.argmax(expected)

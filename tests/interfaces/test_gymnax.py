@@ -12,7 +12,7 @@ from gymnax.wrappers import purerl
 from gymnax.wrappers.gym import GymnaxToGymWrapper
 
 import jaxsense
-from jaxsense.dqn.map_agent import observation
+from jaxsense.dqn.agent import observation
 from jaxsense.interfaces.gymnax import MapEnv
 
 LIDAR, NOP = 1, 3

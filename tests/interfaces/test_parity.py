@@ -9,7 +9,7 @@ import pytest
 import small
 
 import jaxsense
-from jaxsense.tasks.environment import OneAgent
+from jaxsense.tasks.environment import Environment
 
 SEED, NUMBER = 3, 6
 WORD = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)
@@ -17,7 +17,7 @@ WORD = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).intege
 
 @functools.cache
 def played(name):
-    return OneAgent(small.small_mdp(), 1) if name == "own map" else jaxsense.make(name)
+    return Environment(small.small_mdp().of(1)) if name == "own map" else jaxsense.make(name)
 
 
 def module(name):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import small
 
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.team import surroundings
 from jaxsense.interfaces.common import robots_of
 
 AGENTS, NOP = small.AGENTS, small.TEAM_NOP
@@ -30,7 +31,8 @@ def step(key, robots, state, actions):
 
 
 def with_limit(robots, number):
-    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, max_steps=number))
+    config = dataclasses.replace(robots.mdp.config, max_steps=number)
+    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, config=config))
 
 
 def test_the_whole_team_starts_and_is_never_alone(robots):
@@ -42,7 +44,7 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
     assert states.team.works.all()
     assert states.asks.all()
     np.testing.assert_array_equal(states.team.modality, [[0, 0, 1]] * 64)
-    # Robots and PoIs are at places of their own: `TeamConfig.alone` is 1 in these settings.
+    # Robots and PoIs are at places of their own: `Teams.alone` is 1 in these settings.
     assert len(np.unique(states.team.poses[:, :, 0])) == 64 * 3
     assert len(np.unique(states.team.positions[:, :, 0])) > 64
     assert set(np.asarray(states.team.present.sum(axis=1))) <= set(range(1, 9))
@@ -50,8 +52,8 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
 
 def test_every_step_equals_the_mdps(robots):
     mdp = robots.mdp
-    mdp_step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
-    observe = jax.jit(lambda s, r: team_mdp.observation(mdp.travel, s.map.belief, s.team, r, 2))
+    mdp_step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
+    observe = jax.jit(lambda s, r: surroundings(mdp.travel, s.belief, s.team, r, 2))
     state = expected = reset(jax.random.key(3), robots)
     turns, looks = [], 0
     for i in range(11):

@@ -40,7 +40,12 @@ def lost(key, models, known):
     return jnp.array([1.0, 0.5, jnp.nan, 0.0])
 
 
-OWN = {"mine": last_first, "close": close, "lost": lost, "timed": Policy(close, lambda agent: True)}
+OWN = {
+    "mine": last_first,
+    "close": close,
+    "lost": lost,
+    "timed": Policy(close, lambda models: True),
+}
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def test_a_network_reads_from_an_observation_what_it_learns_from(name):
         state = learning.reset(start_key)
         for i, step_key in enumerate(keys):
             state = learning.step(step_key, state, learning.observe(state), jnp.int32(i))[0]
-        seen = task.observe(getattr(state, "now", state))
+        seen = task.observe(state.now)
         return learning.observe(state), task.inputs(seen), jnp.abs(seen).max()
 
     expected, found, largest = jax.vmap(read)(jax.random.split(jax.random.key(0), 32))

@@ -12,7 +12,7 @@ from jaxsense import dqn, tasks
 from jaxsense.config import ConfigError
 from jaxsense.tasks import registry
 from jaxsense.tasks.score import estimate
-from jaxsense.tasks.task import MapTask
+from jaxsense.tasks.task import Task
 
 NAME = "map-v0"
 
@@ -41,7 +41,7 @@ def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
 def optimum_of_eight():
     """Return of the optimum in eight episodes, played without the other references."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MapTask, "references", ("optimal",))
+        patch.setattr(Task, "references", ("optimal",))
         return registry.reference_returns(jaxsense.make(NAME), 1, 8)["optimal"]
 
 
@@ -84,7 +84,7 @@ def test_a_changed_task_has_no_score_under_its_name(reward):
 
 
 def test_a_task_with_a_name_of_its_own_is_compared_in_itself(monkeypatch):
-    monkeypatch.setattr(MapTask, "references", ("optimal",))  # the others take time
+    monkeypatch.setattr(Task, "references", ("optimal",))  # the others take time
     task = jaxsense.make("noisy-v0")
     named = dataclasses.replace(with_reward(task, dqn.Nats(0.2)), name="mine")
     found = jaxsense.score(named, [nop])

@@ -10,7 +10,7 @@ import pytest
 
 import jaxsense
 from benchmarks import ship
-from jaxsense.dqn import team_mdp
+from jaxsense.dqn import mdp as mdps
 from jaxsense.tasks import registry
 from jaxsense.tasks.task import EPISODES, SEEDS, key_of_seed
 
@@ -30,12 +30,12 @@ def programs(name, agent=None):
 def test_a_team_pays_for_the_time_of_all_robots():
     task, reset, step = programs("team-v0")
     _, state = reset(KEY)
-    price = float(task.mdp.config.second_cost)
+    price = float(task.mdp.second_cost)
     assert price > 0
     for _ in range(2):  # both robots choose, then time passes
         before = state
         state, found = step(KEY, state, 0)
-    _, outcome = jax.jit(lambda s: team_mdp.step(KEY, task.mdp, s, jnp.int32(0)))(before)
+    _, outcome = jax.jit(lambda s: mdps.step(KEY, task.mdp, s, jnp.int32(0)))(before)
     assert outcome.seconds > 1
     np.testing.assert_allclose(
         found.reward, outcome.reward - 2 * price * outcome.seconds, rtol=1e-5

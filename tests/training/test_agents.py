@@ -58,7 +58,7 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     used = {}
 
     def train_chunk(key, learning, config, state, starts, evaluation):
-        used["learning"], used["modality"] = learning.mdp.looks.features, learning.modality
+        used["learning"], used["modality"] = learning.mdp.looks.features, learning.mdp.robots[0]
         evaluation(key)(key, "network")
         return state, SimpleNamespace(
             episodes=jnp.array([2, 0]), episode_return=jnp.array([1.5, 9.0]),
@@ -66,9 +66,9 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
             evaluation_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
         )  # fmt: skip
 
-    def evaluation(modality, mdp, config):
+    def evaluation(mdp, config):
         def evaluate(key, q_network):
-            used["evaluation"], used["of"] = mdp.looks.features, (int(modality), q_network)
+            used["evaluation"], used["of"] = mdp.looks.features, (int(mdp.robots[0]), q_network)
 
         return lambda key: evaluate
 

@@ -44,9 +44,9 @@ def same_policy():
 
     @jax.jit
     def compared(models, config):
-        mdp = held_out_mdp(config, models.fusion, detections(held_out=bank))
+        mdp = held_out_mdp(config, models.fusion, detections(held_out=bank), 0)
         return comparison.compare_policies(
-            KEY, jnp.int32(0), models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
+            KEY, models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
         )
 
     def found(repeats):
@@ -73,8 +73,8 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy
 def test_the_learned_return_is_the_mean_over_random_starts():
     @jax.jit
     def returned(bias):
-        mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT))
-        evaluate = comparison.evaluation(jnp.int32(0), mdp, CONFIG)(jax.random.key(1))
+        mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT), 0)
+        evaluate = comparison.evaluation(mdp, CONFIG)(jax.random.key(1))
         return evaluate(KEY, with_bias(bias))
 
     assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0

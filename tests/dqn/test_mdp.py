@@ -1,4 +1,4 @@
-"""The map MDP on looks without networks, whose rewards are worked by hand."""
+"""The MDP of one robot on looks without networks, whose rewards are worked by hand."""
 
 import itertools
 from dataclasses import replace
@@ -10,7 +10,8 @@ import pytest
 from toys import classes_mdp, noisy_mdp
 
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import map_agent, map_mdp
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.agent import observation
 from jaxsense.dqn.rewards import Paper
 
 NOP = 3
@@ -22,17 +23,17 @@ SEEN = jnp.array([[False, False], [True, False], [True, True]])
 
 @jax.jit
 def reset(key, classes, seen):
-    return map_mdp.reset(key, MDP, classes, seen)
+    return mdps.reset(key, MDP, classes, seen)
 
 
 @jax.jit
 def camera_step(state, action):
-    return map_mdp.step(jax.random.key(0), MDP, state, action, 0)
+    return mdps.step(jax.random.key(0), MDP.of(0), state, action)
 
 
 @jax.jit
 def lidar_step(state, action):
-    return map_mdp.step(jax.random.key(0), MDP, state, action, 1)
+    return mdps.step(jax.random.key(0), MDP.of(1), state, action)
 
 
 def start(seen=SEEN):
@@ -41,7 +42,7 @@ def start(seen=SEEN):
 
 def test_state_is_mean_and_deviation_of_one_poi_after_the_other():
     belief = Belief(jnp.array([[1.0, 2.0], [5.0, 6.0]]), jnp.array([[3.0, 4.0], [7.0, 8.0]]))
-    np.testing.assert_array_equal(map_agent.observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
+    np.testing.assert_array_equal(observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
 
 
 def test_reset_writes_what_has_been_seen_and_nothing_else():
@@ -112,9 +113,9 @@ def test_a_step_is_rewarded_by_the_reward_of_its_mdp():
     # PoI 0 unseen, of class 0: 2 - 0. PoI 1 of class 1, seen by the camera: 12 - 10. Of PoI 2 in
     # class 2, seen by the LiDAR, no more is left.
     seen = jnp.array([[0, 0], [1, 0], [0, 1]], bool)
-    state = map_mdp.reset(jax.random.key(0), mdp, CLASSES, seen)
+    state = mdps.reset(jax.random.key(0), mdp, CLASSES, seen)
     for action, expected in ((0, 1.5), (1, 1.5), (2, -0.5), (NOP, 0.0)):
-        _, outcome = map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(action), 1)
+        _, outcome = mdps.step(jax.random.key(0), mdp.of(1), state, jnp.int32(action))
         assert outcome.reward == expected
 
 
@@ -131,7 +132,7 @@ class OfEachClass:
 
 def test_a_reward_of_several_numbers_is_refused():
     with pytest.raises(ValueError, match=r"reward of a look has the shape \(3,\): must be \(\)"):
-        map_mdp.step(jax.random.key(0), replace(MDP, reward=OfEachClass()), start(), 0, 0)
+        mdps.step(jax.random.key(0), replace(MDP, reward=OfEachClass()).of(0), start(), 0)
 
 
 def test_a_look_changes_the_belief_and_the_seen_bit_of_its_poi_alone():
@@ -160,13 +161,13 @@ def test_nop_gives_nothing_ends_the_episode_and_leaves_the_map():
 def test_an_episode_is_cut_after_max_steps():
     mdp, state, cut = classes_mdp(max_steps=3), start(), []
     for _ in range(3):
-        state, outcome = map_mdp.step(jax.random.key(0), mdp, state, jnp.int32(0), 0)
+        state, outcome = mdps.step(jax.random.key(0), mdp.of(0), state, jnp.int32(0))
         cut.append(bool(outcome.truncated))
         assert not outcome.terminated
     assert cut == [False, False, True]
     # An episode that NOP ends is not cut as well.
     late = replace(state, steps=jnp.int32(2))
-    _, outcome = map_mdp.step(jax.random.key(0), mdp, late, jnp.int32(NOP), 0)
+    _, outcome = mdps.step(jax.random.key(0), mdp.of(0), late, jnp.int32(NOP))
     assert outcome.terminated
     assert not outcome.truncated
 
@@ -187,14 +188,15 @@ ORDERS = jnp.array(list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("mdp", [MDP, noisy_mdp()], ids=["classes", "noisy"])
 @pytest.mark.parametrize("modality", [0, 1])
 def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
-    state = map_mdp.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
+    state = mdps.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
 
     def both_ways(order, action):
         # PoI n of the permuted state is PoI order[n] of the other.
         action_there = jnp.append(order, NOP)[action]
         key = jax.random.key(1)
-        here, outcome = map_mdp.step(key, mdp, permute(state, order), action, modality)
-        there, outcome_there = map_mdp.step(key, mdp, state, action_there, modality)
+        here, outcome = mdps.step(key, mdp.of(modality), permute(state, order), action)
+        outcome = replace(outcome, poi=jnp.append(order, NOP)[outcome.poi])
+        there, outcome_there = mdps.step(key, mdp.of(modality), state, action_there)
         return (here, outcome), (permute(there, order), outcome_there)
 
     pairs = jax.vmap(jax.vmap(both_ways, in_axes=(None, 0)), in_axes=(0, None))
@@ -206,7 +208,7 @@ def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
 @pytest.fixture(scope="module")
 def many_starts():
     keys = jax.random.split(jax.random.key(0), 12_400)
-    classes, seen = jax.jit(jax.vmap(lambda key: map_mdp.random_start(key, MDP)))(keys)
+    classes, seen = jax.jit(jax.vmap(lambda key: mdps.random_start(key, MDP)))(keys)
     return np.asarray(classes), np.asarray(seen)
 
 

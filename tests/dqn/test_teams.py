@@ -1,5 +1,6 @@
-"""The team's MDP with times worked by hand, on maps whose rewards are known."""
+"""The MDP of teams with times worked by hand, on maps whose rewards are known."""
 
+import dataclasses
 import math
 
 import jax
@@ -10,24 +11,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toys import PLACES, TRAVEL, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
-from jaxsense.dqn import map_mdp, team_mdp
-from jaxsense.dqn.team_mdp import Team, TeamState
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.team import Team, Travel
 
 NOP, CAMERA, LIDAR = 3, 0, 1
 FIRST = 0.2 - 1 / np.sqrt(40)  # gain of a look, see `toys.classes_mdp`
 
 
-def make_mdp(mapped=None, places=PLACES, robots_each=1, **config):
+def make_mdp(mapped=None, places=PLACES, robots=(0, 1), **config):
     mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
-    poses = jnp.arange(3.0 * robots_each * mapped.num_modalities).reshape(-1, 3)
-    given = {"num_pois": (1, 3), "robots_each": robots_each, **config}
+    poses = jnp.arange(3.0 * len(robots)).reshape(-1, 3)
+    given = {"num_pois": (1, 3), "robots": jnp.array(robots), **config}
     return team_mdp_of(mapped, Fixed(places, poses), **given)
 
 
 MDP = make_mdp()
 
 
-reset_map = jax.jit(map_mdp.reset)
+reset = jax.jit(mdps.reset)
 
 
 def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
@@ -35,7 +36,7 @@ def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
     number = len(poses)
     works = np.ones(number, bool) if works is None else np.array(works)
     seen = np.zeros((3, 2), bool) if seen is None else np.array(seen, bool)
-    known = reset_map(jax.random.key(0), mdp.map, np.array([0, 1, 2]), seen)
+    known = reset(jax.random.key(0), mdp, np.array([0, 1, 2]), seen)
     team = Team(
         positions=places,
         present=jnp.ones(3, bool),
@@ -44,13 +45,16 @@ def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
         works=jnp.asarray(works),
         target=jnp.asarray(np.full(number, NOP)),
     )
-    first, seconds = np.int32(np.argmax(works)), np.zeros(number, np.float32)
-    return TeamState(
-        known, team, jnp.asarray(works), jnp.asarray(first), jnp.asarray(seconds), jnp.float32(0)
+    return dataclasses.replace(
+        known,
+        team=team,
+        asks=jnp.asarray(works),
+        agent=jnp.int32(np.argmax(works)),
+        looked=jnp.zeros(number),
     )
 
 
-jitted = jax.jit(lambda key, state, action: team_mdp.step(key, MDP, state, action))
+jitted = jax.jit(lambda key, state, action: mdps.step(key, MDP, state, action))
 
 
 def play(state, *actions):
@@ -65,11 +69,13 @@ def play(state, *actions):
 
 @jax.jit
 def reset_all(keys, mdp):
-    return jax.vmap(lambda key: team_mdp.reset(key, mdp))(keys)
+    return jax.vmap(lambda key: mdps.reset(key, mdp))(keys)
 
 
 def resets(**given):
-    return reset_all(jax.random.split(jax.random.key(3), 600), make_mdp(robots_each=2, **given))
+    return reset_all(
+        jax.random.split(jax.random.key(3), 600), make_mdp(robots=(0, 0, 1, 1), **given)
+    )
 
 
 def test_teams_start_with_every_number_of_pois_and_of_robots():
@@ -102,7 +108,7 @@ def test_alone_one_robot_of_either_modality_is_where_everything_is():
     np.testing.assert_array_equal(found.team.poses, 0.0)
     # Any share of the six looks is taken. The share's variance is 1/12, and that of the mean of six
     # coins of that share 1/6 of 1/6 on average: 1/9 in all.
-    shares = np.mean(found.map.seen, axis=(1, 2))
+    shares = np.mean(found.seen, axis=(1, 2))
     np.testing.assert_allclose(shares.mean(), 1 / 2, atol=4 / 3 / np.sqrt(600))
     # Each number of looks is as likely as any other: 600 / 7 +- 4 sqrt(600 x 6/49) = +- 34.
     np.testing.assert_allclose(np.bincount(np.rint(6 * shares).astype(int)), 600 / 7, atol=34)
@@ -113,10 +119,10 @@ def test_shares_of_episodes_alone_and_partly_seen():
     alone = np.asarray(found.team.works).sum(axis=1) == 1
     np.testing.assert_allclose(alone.mean(), 0.25, atol=4 * np.sqrt(0.25 * 0.75 / 600))
     # Of the others half start late, in which 1 of 7 has seen nothing all the same.
-    has_seen = np.asarray(found.map.seen).any(axis=(1, 2))[~alone]
+    has_seen = np.asarray(found.seen).any(axis=(1, 2))[~alone]
     np.testing.assert_allclose(has_seen.mean(), 0.5 * 6 / 7, atol=4 * 0.5 / np.sqrt(450))
-    assert not np.any(resets(alone=0.0, partly_seen=0.0).map.seen)
-    late = np.asarray(resets(alone=0.0, partly_seen=1.0).map.seen)
+    assert not np.any(resets(alone=0.0, partly_seen=0.0).seen)
+    late = np.asarray(resets(alone=0.0, partly_seen=1.0).seen)
     assert late.any(axis=(1, 2)).mean() > 0.7
 
 
@@ -141,8 +147,8 @@ def test_two_robots_as_worked_by_hand():
     np.testing.assert_array_equal(states[0].team.target, [0, NOP])
     np.testing.assert_array_equal(states[1].team.target, [NOP, 1])
     np.testing.assert_array_equal(states[2].team.works, [False, True])
-    np.testing.assert_array_equal(states[1].map.seen, [[1, 0], [0, 0], [0, 0]])
-    np.testing.assert_array_equal(states[2].map.seen, [[1, 0], [0, 1], [0, 0]])
+    np.testing.assert_array_equal(states[1].seen, [[1, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(states[2].seen, [[1, 0], [0, 1], [0, 0]])
 
 
 def test_robots_look_side_by_side():
@@ -172,13 +178,13 @@ def test_first_choices_go_round_the_robots_that_work():
     # The third choice is of PoI 0, 6 s away: robot 3 looks first.
     np.testing.assert_allclose([o.seconds for o in outcomes], [0, 0, 6], atol=1e-5)
     np.testing.assert_array_equal(states[2].team.poses[1], 0.0)  # that one takes no part
-    assert states[2].map.seen[0, LIDAR]
+    assert states[2].seen[0, LIDAR]
 
 
 def test_an_episode_is_cut_after_its_own_number_of_choices():
     mdp = make_mdp(classes_mdp(partly_seen_starts=False, max_steps=1), max_steps=3)
     state, cut = start([[0, 0, 0]], [CAMERA], mdp), []
-    step = jax.jit(lambda key, state, action: team_mdp.step(key, mdp, state, action))
+    step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
     for _ in range(3):
         state, outcome = step(jax.random.key(0), state, jnp.int32(0))
         cut.append(bool(outcome.truncated))
@@ -189,46 +195,56 @@ def test_an_episode_is_cut_after_its_own_number_of_choices():
 
 
 @jax.jit
-def alone_and_on_the_map(key, mdp, team, known, action, modality):
-    there = map_mdp.step(key, mdp.map, known, action, modality)
-    return team_mdp.step(key, mdp, team, action), there
+def alone_and_on_the_map(key, mdp, team, mapped, known, action):
+    return mdps.step(key, mdp, team, action), mdps.step(key, mapped, known, action)
 
 
 @pytest.mark.parametrize("modality", [CAMERA, LIDAR])
 @pytest.mark.parametrize("mapped", [classes_mdp(partly_seen_starts=False), noisy_mdp()])
 def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
+    mapped = mapped.of(modality)
+    # Of two robots, so that all sensors look.
+    known = team = reset(jax.random.key(4), mapped)
     mdp = make_mdp(mapped)
-    alone = team_mdp.alone(3, modality)
-    known = reset_map(jax.random.key(4), mapped)
-    one = jnp.ones(1, bool)
-    team = TeamState(known, alone, one, jnp.int32(0), jnp.zeros(1), jnp.float32(0))
     for i, action in enumerate([0, 2, 2, 1, NOP]):
         key = jax.random.key(10 + i)
         (team, here), (known, there) = alone_and_on_the_map(
-            key, mdp, team, known, jnp.int32(action), jnp.int32(modality)
+            key, mdp, team, mapped, known, jnp.int32(action)
         )
         np.testing.assert_allclose(here.reward, there.reward, rtol=1e-6)
         assert here.terminated == there.terminated
         assert float(here.seconds) == (0 if action == NOP else 1)
-        jax.tree.map(np.testing.assert_array_equal, team.map, known)
+        for name in ("belief", "seen", "classes", "scene", "steps"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(team, name), getattr(known, name))
 
 
 def test_an_episode_of_a_given_team_has_these_robots_and_no_other():
-    modality = jnp.array([1, 0, 1, 1])
-    mdp = make_mdp(robots_each=2, alone=1.0)
-    # Not an input: that there are such sensors is checked on the host.
-    state = jax.jit(lambda key: team_mdp.reset(key, mdp, modality))(jax.random.key(0))
-    np.testing.assert_array_equal(state.team.modality, modality)
+    mdp = make_mdp(robots=(1, 0, 1, 1), alone=1.0, is_random=False)
+    state = reset(jax.random.key(0), mdp)
+    np.testing.assert_array_equal(state.team.modality, [1, 0, 1, 1])
     np.testing.assert_array_equal(state.team.works, True)
     np.testing.assert_array_equal(state.asks, True)
     # It is never alone.
     np.testing.assert_array_equal(state.team.positions, PLACES)
-    with pytest.raises(ValueError, match="modality = 2: must be a whole number from 0 to 1"):
-        team_mdp.reset(jax.random.key(0), mdp, jnp.array([0, 2, 0, 0]))
+    with pytest.raises(ValueError, match="robots = 2: must be a whole number from 0 to 1"):
+        mdps.reset(jax.random.key(0), make_mdp(robots=(0, 2, 0, 0)))
 
 
-seconds_of_ways = jax.jit(team_mdp.travel_seconds)
-move = jax.jit(team_mdp.move)
+def test_the_only_robot_of_a_team_may_have_any_sensor():
+    mdp = team_mdp_of(classes_mdp(), Fixed(PLACES, jnp.zeros((1, 3)))).of(LIDAR)
+    state = reset(jax.random.key(0), mdp)
+    np.testing.assert_array_equal(state.team.modality, [LIDAR])
+    np.testing.assert_array_equal(state.team.works, [True])
+
+
+def test_a_state_of_another_mdp_is_refused():
+    state = reset(jax.random.key(0), classes_mdp(num_pois=2))
+    with pytest.raises(ValueError, match=r"state.seen has the shape \(2, 2\): must be \(3, 2\)"):
+        mdps.step(jax.random.key(0), MDP, state, jnp.int32(0))
+
+
+seconds_of_way = jax.jit(Travel.seconds)
+move = jax.jit(Travel.move)
 
 
 @pytest.mark.parametrize(
@@ -250,8 +266,8 @@ move = jax.jit(team_mdp.move)
     ],
 )
 def test_time_until_a_look_as_worked_by_hand(pose, place, seconds):
-    pose, places = jnp.array(pose, jnp.float32), jnp.array([place], jnp.float32)
-    np.testing.assert_allclose(seconds_of_ways(TRAVEL, pose, places), [seconds], rtol=1e-4)
+    pose, place = jnp.array(pose, jnp.float32), jnp.array(place, jnp.float32)
+    np.testing.assert_allclose(seconds_of_way(TRAVEL, pose, place), seconds, rtol=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +290,12 @@ def test_the_pose_on_the_way_as_worked_by_hand(seconds, expected):
 @jax.jit
 def in_two_parts(pose, place, share):
     """The time of a way in one part; in two; and the pose at its end, in one and in two."""
-    whole = team_mdp.travel_seconds(TRAVEL, pose, place[None])[0]
+    whole = TRAVEL.seconds(pose, place)
     before = share * (whole - TRAVEL.look_seconds)
-    between = team_mdp.move(TRAVEL, pose, place, before)
-    rest = team_mdp.travel_seconds(TRAVEL, between, place[None])[0]
-    end = team_mdp.move(TRAVEL, pose, place, whole)
-    return whole, before + rest, end, team_mdp.move(TRAVEL, between, place, rest)
+    between = TRAVEL.move(pose, place, before)
+    rest = TRAVEL.seconds(between, place)
+    end = TRAVEL.move(pose, place, whole)
+    return whole, before + rest, end, TRAVEL.move(between, place, rest)
 
 
 PLACE = st.floats(-3, 3, width=32)

@@ -1,0 +1,177 @@
+"""The agent of a Q-network, and the environment in which it learns."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsense.core import checks, networks
+from jaxsense.core.networks import MLP, Params
+from jaxsense.core.types import Belief, Key, Transition, pytree
+from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn.mdp import Mdp, Outcome, State
+from jaxsense.dqn.pooling import PoolingNetwork
+from jaxsense.dqn.team import Team, Travel, num_features, own_seconds, surroundings
+
+
+@pytree
+class Agent:
+    """A Q-network and what it observes.
+
+    Without travel, a dense network reads the whole map, and looks take a step. With it, one network
+    for any number of PoIs reads the surroundings of a robot, and time counts.
+
+    Attributes:
+      discount: `[]` discount factor of a step; with travel, of a second.
+      second_cost: `[]` price of a second of travel.
+      useless: `[]` reward of a look that tells nothing.
+      num_pois: number of PoIs; with travel, the largest that it learns with.
+    """
+
+    discount: jax.Array | float
+    second_cost: jax.Array | float
+    useless: jax.Array | float
+    travel: Travel | None
+    num_pois: int = struct.field(pytree_node=False)
+    num_modalities: int = struct.field(pytree_node=False)
+    latent_size: int = struct.field(pytree_node=False)
+    hidden: tuple[int, ...] = struct.field(pytree_node=False)
+
+    @property
+    def network(self) -> MLP | PoolingNetwork:
+        """The Q-network."""
+        if self.travel is None:
+            return MLP(self.hidden, self.num_pois + 1)
+        return PoolingNetwork(self.hidden, num_features(self.latent_size, self.num_modalities))
+
+    def plays(self, num_pois: int) -> bool:
+        """Whether the Q-network is for this number of PoIs."""
+        return self.travel is not None or num_pois == self.num_pois
+
+    def init(self, key: Key) -> Params:
+        """Random parameters of the Q-network."""
+        size = 2 * self.latent_size if self.travel is None else self.network.features
+        return networks.init(key, self.network, size * self.num_pois)
+
+    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+        """Input of the Q-network: `observation`, or `[F * N]` of `surroundings`."""
+        if self.travel is None:
+            return observation(belief)
+        return surroundings(self.travel, belief, team, robot, self.num_modalities).reshape(-1)
+
+    def q(
+        self,
+        params: Params,
+        observed: Float[Array, "S ..."],
+        others: Float[Array, "S ..."] | None = None,
+    ) -> Float[Array, "A ..."]:
+        """Values of looks, once the robot has arrived; NOP's last.
+
+        Args:
+          params: of the Q-network.
+          observed: what the robot knows.
+          others: with travel, what each PoI's value takes the other PoIs to be; as observed by
+            default.
+        """
+        inputs = (observed,) if others is None else (observed, others)
+        return networks.apply(self.network, params, *inputs)
+
+    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Values of actions as the robot sets out.
+
+        With travel `discount^t q - second_cost t`, with `t` the seconds until the look. NOP takes
+        none.
+        """
+        after = self.q(params, observed)
+        if self.travel is None:
+            return after
+        of_pois = self.discount ** self.seconds(observed) * after[:-1]
+        return jnp.concatenate([self.less_way(of_pois, observed), after[-1:]])
+
+    def seconds(self, observed: Float[Array, "S ..."]) -> Float[Array, "N ..."]:
+        """The robot's own time to look at each PoI, from what it observes; with travel."""
+        features = num_features(self.latent_size, self.num_modalities)
+        return own_seconds(observed.reshape(features, -1, *observed.shape[1:]), self.latent_size)
+
+    def less_way(
+        self, after: Float[Array, "N ..."], observed: Float[Array, "S ..."]
+    ) -> Float[Array, "N ..."]:
+        """Values on arrival less the price of the way there; with travel."""
+        return after - self.second_cost * self.seconds(observed)
+
+
+@checks.typed
+def observation(belief: Belief) -> Float[Array, " S"]:
+    """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI."""
+    chex.assert_rank(belief.mean, 2)
+    chex.assert_equal_shape([belief.mean, belief.std])
+    checks.require_positive("belief.std", belief.std)
+    return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
+
+
+@pytree
+class Underway:
+    """A state, with each robot's observation and choice when it last set out."""
+
+    now: State
+    observation: Float[Array, "R S"]
+    action: Int[Array, " R"]
+
+
+@pytree
+class Environment:
+    """What an agent learns in: an MDP, whose robots share the agent."""
+
+    agent: Agent
+    mdp: Mdp
+
+    def reset(self, key: Key) -> Underway:
+        """A random first state."""
+        return self.begin(mdps.reset(key, self.mdp))
+
+    def begin(self, now: State) -> Underway:
+        """A first state, in which no robot has set out."""
+        num_robots, seen = len(now.team.works), self._observe(now)
+        nothing = jnp.zeros((num_robots, len(seen)))
+        return Underway(now, nothing, jnp.full(num_robots, self.mdp.num_pois))
+
+    def action_mask(self, state: Underway) -> Bool[Array, " A"]:
+        """Actions that exist."""
+        return state.now.team.action_mask
+
+    def observe(self, state: Underway) -> Float[Array, " S"]:
+        """What the robot that chooses observes."""
+        return self._observe(state.now)
+
+    def step(
+        self, key: Key, state: Underway, s_tm1: Float[Array, " S"], action: Int[Array, ""]
+    ) -> tuple[Underway, Transition, Outcome]:
+        """Lets one robot choose.
+
+        Args:
+          key: random key.
+          state: before the choice.
+          s_tm1: what `observe` returned for the state.
+          action: the choice.
+
+        Returns:
+          The next state; the transition of the robot that has just looked, from when it set out, or
+          else of NOP, after which nothing is earned; and the outcome.
+        """
+        seen = state.observation.at[state.now.agent].set(s_tm1)
+        chosen = state.action.at[state.now.agent].set(action)
+        now, outcome = mdps.step(key, self.mdp, state.now, action)
+        # The values of those who travel are discounted already.
+        discount = self.agent.discount if self.agent.travel is None else 1.0
+        transition = Transition(
+            s_tm1=seen[now.agent],
+            a_tm1=chosen[now.agent],
+            r_t=outcome.reward,
+            discount_t=jnp.where(outcome.poi < self.mdp.num_pois, discount, 0.0),
+            s_t=self._observe(now),
+        )
+        return Underway(now, seen, chosen), transition, outcome
+
+    def _observe(self, state: State) -> jax.Array:
+        return self.agent.observe(state.belief, state.team, state.agent)

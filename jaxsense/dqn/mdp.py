@@ -1,0 +1,394 @@
+"""The shared map as a Markov decision process.
+
+Korthals et al. 2018, Sec. III and IV. The map holds a Gaussian belief for each of N points of
+interest. Action n < N looks at PoI n with the robot's own sensor and updates its belief; action N
+is no operation (NOP), after which the robot is done. The episode ends with the last robot.
+
+Without `teams`, one robot looks in every step: the paper's MDP. With them, robots take turns. In
+each step one robot chooses; if all have chosen, time passes until a robot arrives and looks, which
+chooses next. For each robot this is a semi-Markov decision process (Sutton, Precup and Singh 1999,
+Artificial Intelligence 112, Sec. 3): an action takes the time until its look.
+"""
+
+import dataclasses
+import functools
+from typing import Protocol
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxsense.config import MdpConfig
+from jaxsense.core import checks
+from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
+from jaxsense.dqn.rewards import Reward
+from jaxsense.dqn.team import Steps, Team, Teams, Travel, alone, num_features, surroundings
+
+
+class Looks(Protocol):
+    """Protocol of the source of an MDP's looks, for example `Bank` or `Live`; a frozen pytree."""
+
+    @property
+    def num_modalities(self) -> int:
+        """M."""
+        ...
+
+    def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
+        """A random scene with PoIs of the given classes."""
+        ...
+
+    def observe(
+        self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
+    ) -> tuple[Float[Array, " L"], Scene]:
+        """Looks at a PoI.
+
+        Returns:
+          `[D_m]` features, and the scene after the look.
+        """
+        ...
+
+
+@pytree
+class Mdp:
+    """The MDP of robots that share one map.
+
+    Attributes:
+      config: length and starts of episodes.
+      num_pois: number of PoIs; of teams, the largest.
+      robots: index of each robot's sensor.
+      teams: how robots travel; None for one robot that looks once in each step.
+    """
+
+    looks: Looks
+    fusion: Fusion
+    reward: Reward
+    config: MdpConfig
+    num_pois: int = struct.field(pytree_node=False)
+    robots: Int[Array, " R"] | tuple[Index, ...]
+    teams: Teams | None = None
+
+    @property
+    def num_modalities(self) -> int:
+        """M, the number of sensors."""
+        return self.looks.num_modalities
+
+    @property
+    def modalities(self) -> tuple[str, ...]:
+        """Names of the sensors; of a team."""
+        return () if self.teams is None else self.teams.modalities
+
+    @property
+    def num_actions(self) -> int:
+        """A: a look at each PoI, and NOP."""
+        return self.num_pois + 1
+
+    @property
+    def num_classes(self) -> int:
+        """C, the number of classes that a PoI can have."""
+        return len(self.fusion.classes.mean)
+
+    @property
+    def num_features(self) -> int:
+        """F, numbers that a robot knows of each PoI, see `features`."""
+        size = self.fusion.prior.mean.size
+        return 2 * size if self.teams is None else num_features(size, self.num_modalities)
+
+    @property
+    def travel(self) -> Travel | Steps:
+        """How long a look takes."""
+        return Steps() if self.teams is None else self.teams.travel
+
+    @property
+    def is_single(self) -> bool:
+        """Whether there is one robot, whose sensor is then the same in all episodes."""
+        return len(self.robots) == 1
+
+    def sensor(self, team: Team, robot: Int[Array, ""]) -> Index:
+        """Index of a robot's sensor."""
+        return self.robots[0] if self.is_single else team.modality[robot]
+
+    def of(self, modality: Index) -> "Mdp":
+        """The MDP in which the only robot has another sensor."""
+        teams = self.teams and dataclasses.replace(self.teams, is_random=False)
+        return dataclasses.replace(self, robots=(modality,), teams=teams)
+
+    def information(self, belief: Belief) -> Float[Array, ""]:
+        """`[]` information of a `[D]` belief, in units of the reward."""
+        return self.reward.information(belief, self.fusion.class_probabilities(belief))
+
+    def features(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, "N F"]:
+        """What a robot knows of each PoI: its belief; of a team see `surroundings`."""
+        if self.teams is None:
+            return jnp.concatenate([belief.mean, belief.std], axis=-1)
+        return surroundings(self.teams.travel, belief, team, robot, self.num_modalities).T
+
+    @property
+    def second_cost(self) -> jax.Array | float:
+        """Price of a second of each robot that works."""
+        return 0.0 if self.teams is None else self.teams.config.second_cost
+
+    def earned(self, outcome: "Outcome", team: Team) -> Float[Array, ""]:
+        """The reward, less the price of time of all robots that then work."""
+        number = jnp.sum(team.works, dtype=outcome.seconds.dtype)
+        return outcome.reward - self.second_cost * outcome.seconds * number
+
+
+@pytree
+class State:
+    """The map, the scene that it describes, and the robots before one of them chooses.
+
+    Attributes:
+      seen: `[N, M]` bool, which modalities have looked at which PoI; hidden from the policies.
+      classes: `[N]` int32 true classes; hidden from the policies.
+      scene: what the looks see; hidden from the policies.
+      steps: `[]` int32 choices so far.
+      asks: `[R]` bool, robots that have yet to choose at this moment; at first all that work.
+      agent: `[]` int32 the robot that chooses.
+      looked: `[R]` seconds that each robot has been looking.
+      seconds: `[]` since the start; without travel, looks.
+    """
+
+    belief: Belief
+    seen: jax.Array
+    classes: jax.Array
+    scene: Scene
+    steps: jax.Array
+    team: Team
+    asks: jax.Array
+    agent: jax.Array
+    looked: jax.Array
+    seconds: jax.Array
+
+
+@pytree
+class Outcome:
+    """Outcome of a choice.
+
+    Attributes:
+      reward: `[]` of the look, if there was one, by the robot that chooses next.
+      terminated: `[]` bool, all robots are done.
+      truncated: `[]` bool, the episode has reached its limit of steps.
+      seconds: `[]` that passed; without travel, 1 for a look.
+      poi: `[]` int32 that was looked at; N for none.
+    """
+
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    seconds: jax.Array
+    poi: jax.Array
+
+
+def random_start(key: Key, mdp: Mdp) -> tuple[Int[Array, " N"], Bool[Array, "N M"]]:
+    """Random classes and earlier looks of one robot.
+
+    Returns:
+      Independent `[N]` int32 classes, and `[N, M]` bool, which modality has looked at which PoI.
+    """
+    class_key, seen_key = jax.random.split(key)
+    classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
+    shape = mdp.num_pois, mdp.num_modalities
+    if not mdp.config.partly_seen_starts:
+        return classes, jax.random.bernoulli(seen_key, 0.5, shape)
+    # Neither all zero nor all one.
+    num_bits = mdp.num_pois * mdp.num_modalities
+    code = jax.random.randint(seen_key, (), 1, 2**num_bits - 1)
+    return classes, (code >> jnp.arange(num_bits) & 1).astype(bool).reshape(shape)
+
+
+def reset(
+    key: Key,
+    mdp: Mdp,
+    classes: Int[Array, " N"] | None = None,
+    seen: Bool[Array, "N M"] | None = None,
+) -> State:
+    """Starts an episode in which some modalities have looked at some of the PoIs.
+
+    Args:
+      seen: `[N, M]` bool, which modality has looked at which PoI; random by default.
+
+    Returns:
+      The state, whose map holds real looks. Those at a PoI are fused in the order of the
+      modalities, starting from a random one.
+
+    Raises:
+      ValueError: if a class or a sensor does not exist.
+    """
+    checks.require_key(key)
+    return reset_with_looks(key, mdp, classes, seen)[0]
+
+
+def reset_with_looks(
+    key: Key,
+    mdp: Mdp,
+    classes: Int[Array, " N"] | None = None,
+    seen: Bool[Array, "N M"] | None = None,
+) -> tuple[State, tuple[jax.Array, ...]]:
+    """Starts an episode as `reset` does, and also returns the features of its looks.
+
+    Returns:
+      The state, and for each modality `[N, D_m]` features of a look at each PoI; those that `seen`
+      marks have updated the map.
+    """
+    robots = jnp.asarray(mdp.robots, jnp.int32)
+    checks.require_index("robots", robots, mdp.num_modalities)
+    if mdp.teams is None:
+        team = alone(mdp.num_pois, robots)
+    else:
+        key, *keys = jax.random.split(key, 6)
+        team, drawn = mdp.teams.draw(keys, mdp.num_pois, robots)
+        seen = drawn if seen is None else seen
+    start_key, scene_key, begin_key, look_key = jax.random.split(key, 4)
+    if classes is None or seen is None:
+        random_classes, random_seen = random_start(start_key, mdp)
+        classes = random_classes if classes is None else classes
+        seen = random_seen if seen is None else seen
+    chex.assert_shape(classes, (mdp.num_pois,))
+    checks.require_index("classes", classes, mdp.num_classes)
+    scene = mdp.looks.scene(scene_key, classes)
+    pois = jnp.arange(mdp.num_pois)
+    looks = tuple(
+        jax.vmap(lambda key, poi: mdp.looks.observe(key, scene, poi, m)[0])(keys, pois)  # noqa: B023
+        for m, keys in enumerate(jax.random.split(look_key, (mdp.num_modalities, mdp.num_pois)))
+    )
+    return begin(begin_key, mdp, team, scene, classes, seen, looks), looks
+
+
+def begin(
+    key: Key,
+    mdp: Mdp,
+    team: Team,
+    scene: Scene,
+    classes: Int[Array, " N"],
+    seen: Bool[Array, "N M"],
+    looks: tuple[jax.Array, ...],
+) -> State:
+    """Starts an episode of a team in a given scene, see `reset`.
+
+    Args:
+      looks: for each modality `[N, D_m]` features of a look at each PoI; ignored where `seen` is
+        False.
+    """
+    chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities))
+    if seen.dtype != bool:
+        raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
+    first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
+    beliefs = jax.vmap(functools.partial(_looked_at, mdp))(looks, seen, first)
+    return State(
+        belief=beliefs,
+        seen=seen,
+        classes=classes,
+        scene=scene,
+        steps=jnp.int32(0),
+        team=team,
+        asks=team.works,
+        agent=jnp.argmax(team.works).astype(jnp.int32),
+        looked=jnp.zeros(len(team.works)),
+        seconds=jnp.float32(0.0),
+    )
+
+
+@checks.typed
+def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[State, Outcome]:
+    """Lets one robot choose; if all have chosen, time passes until the next look.
+
+    Returns:
+      The next state and the outcome. The reward is that of the look, see `Reward`; 0 if there was
+      none; NaN if the gain is NaN or a traced action does not exist.
+
+    Raises:
+      ValueError: if there is no such action, or if the reward is not one number.
+    """
+    checks.require_key(key)
+    checks.require_shape("state.seen", state.seen, (mdp.num_pois, mdp.num_modalities))
+    chex.assert_rank(action, 0)
+    checks.require_index("action", action, mdp.num_actions)
+    team, nop = state.team, mdp.num_pois
+    robots = jnp.arange(len(team.works))
+    is_agent = robots == state.agent
+    target = jnp.where(is_agent, action, team.target)
+    works = team.works & ~(is_agent & (action == nop))
+    asks = state.asks & ~is_agent
+    terminated = ~jnp.any(works)
+    passes = ~jnp.any(asks) & ~terminated
+
+    goals = team.positions.at[target].get(mode="clip")
+    times = jax.vmap(mdp.travel.seconds)(team.poses, goals)
+    left = times - state.looked
+    looker = jnp.argmin(jnp.where(works, left, jnp.inf)).astype(jnp.int32)
+    is_looker = robots == looker
+    seconds = jnp.where(passes, left[looker], 0.0)
+    # A look under way continues while another robot looks.
+    looked = jnp.maximum(state.looked + seconds - (times - mdp.travel.look_seconds), 0.0)
+    looked = jnp.where(is_looker, 0.0, jnp.minimum(looked, mdp.travel.look_seconds))
+    moved = jax.vmap(lambda pose, goal: mdp.travel.move(pose, goal, seconds))(team.poses, goals)
+    poi = jnp.where(passes, target[looker], nop)
+    changed, reward = _look(key, mdp, state, poi, looker)
+
+    following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
+    after = dataclasses.replace(
+        state,
+        **changed,
+        steps=state.steps + 1,
+        team=dataclasses.replace(
+            team,
+            poses=jnp.where(works[:, None], moved, team.poses),
+            works=works,
+            target=jnp.where(passes & is_looker, nop, target),
+        ),
+        asks=jnp.where(passes, is_looker, asks),
+        agent=jnp.where(passes, looker, following.astype(jnp.int32)),
+        looked=jnp.where(passes, looked, state.looked),
+        seconds=state.seconds + seconds,
+    )
+    truncated = ~terminated & (after.steps >= mdp.config.max_steps)
+    return after, Outcome(reward, terminated, truncated, seconds, poi)
+
+
+def _look(
+    key: Key, mdp: Mdp, state: State, poi: Int[Array, ""], looker: Int[Array, ""]
+) -> tuple[dict[str, PyTree], Float[Array, ""]]:
+    """What a robot's look changes, or NOP, and the `[]` reward."""
+    is_nop, place = poi == mdp.num_pois, jnp.minimum(poi, mdp.num_pois - 1)
+    old = jax.tree.map(lambda x: x[place], state.belief)
+
+    def look(modality: int) -> tuple[Belief, Scene]:
+        features, scene = mdp.looks.observe(key, state.scene, place, modality)
+        return mdp.fusion.update(old, state.seen[place], features, modality), scene
+
+    modality = mdp.sensor(state.team, looker)
+    if mdp.is_single:
+        new, scene = call(look, modality, mdp.num_modalities)
+    else:
+        # Every sensor looks and one look is kept: under `vmap` a switch takes many times as long.
+        new, scene = look(0)
+        for m in range(1, mdp.num_modalities):
+            kept = functools.partial(jnp.where, modality == m)
+            new, scene = jax.tree.map(kept, look(m), (new, scene))
+    of_look = mdp.reward.of_gain(mdp.information(new) - mdp.information(old))
+    checks.require_shape("reward of a look", of_look, ())
+    exists = (poi >= 0) & (poi <= mdp.num_pois)
+    looked = {
+        "belief": jax.tree.map(lambda x, y: x.at[place].set(y), state.belief, new),
+        "seen": state.seen.at[place, modality].set(True),
+        "scene": scene,
+    }
+    before = {name: getattr(state, name) for name in looked}
+    changed = jax.tree.map(functools.partial(jnp.where, is_nop), before, looked)
+    return changed, jnp.where(exists, jnp.where(is_nop, 0.0, of_look), jnp.nan)
+
+
+def _looked_at(mdp: Mdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:
+    """Belief after the looks marked in `seen`, taken in modality order starting from `first`."""
+    belief = mdp.fusion.prior
+    for start in range(mdp.num_modalities):
+        order = [(start + i) % mdp.num_modalities for i in range(mdp.num_modalities)]
+        written, seen_so_far = mdp.fusion.prior, jnp.zeros(mdp.num_modalities, bool)
+        for m in order:
+            new = mdp.fusion.update(written, seen_so_far, looks[m], m)
+            written = jax.tree.map(lambda n, o: jnp.where(seen[m], n, o), new, written)  # noqa: B023
+            seen_so_far = seen_so_far.at[m].set(seen[m])
+        belief = jax.tree.map(lambda n, o: jnp.where(first == start, n, o), written, belief)  # noqa: B023
+    return belief
