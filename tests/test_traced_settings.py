@@ -140,3 +140,12 @@ def test_arrays_are_checked_like_numbers_unless_they_are_traced_or_a_batch():
     assert dataclasses.replace(CONFIG, viewpoint=many).viewpoint.min_distance is batch
     traced = jax.jit(lambda x: dataclasses.replace(CONFIG.viewpoint, min_distance=x))(2.0)
     assert traced.min_distance == 2.0
+
+
+def test_a_traced_number_leaves_the_relations_of_others_checked():
+    def alone(alpha):
+        settings = dataclasses.replace(CONFIG.jmvae, alpha=alpha)
+        return dataclasses.replace(CONFIG, jmvae=settings, modalities=("camera",)).jmvae.alpha
+
+    with pytest.raises(ValueError, match=r"jmvae\.reconstruction_weights = "):
+        jax.jit(alone)(0.5)

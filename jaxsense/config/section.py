@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import (
     Annotated,
+    Any,
     ClassVar,
     Literal,
     NoReturn,
@@ -285,7 +286,7 @@ class Checked:
 class Section(Checked):
     """Base of the sections: a pytree whose leaves are the fields declared `Traced`, and sections.
 
-    Relations between fields are not checked while JAX traces one of them, or for a batch.
+    A leaf that JAX traces, and a batch, pass the checks of their relations with other fields.
     """
 
     LEAVES: ClassVar[tuple[str, ...]] = ()
@@ -298,8 +299,34 @@ class Section(Checked):
 
     def __post_init__(self):
         check_fields(self)
-        if not any(map(_is_unknown, jax.tree.leaves(self))):
-            self.check()
+        _known(self).check()
+
+
+class _Unknown:
+    """A traced number: what it is compared with is right, what is computed from it unknown."""
+
+    def _unknown(self, *_: object) -> "_Unknown":
+        return self
+
+    __lt__ = __le__ = __gt__ = __ge__ = _unknown
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = _unknown
+    __truediv__ = __rtruediv__ = __mod__ = __neg__ = __abs__ = __round__ = _unknown
+
+    def __format__(self, spec: str) -> str:
+        return "a traced number"
+
+
+def _known(value: Any) -> Any:
+    """Settings with numbers for scalar arrays, and `_Unknown` for other leaves."""
+    if isinstance(value, Section):
+        known = object.__new__(type(value))
+        vars(known).update({name: _known(each) for name, each in vars(value).items()})
+        return known
+    if isinstance(value, tuple):
+        return tuple(map(_known, value))
+    if isinstance(value, jax.Array | jax.ShapeDtypeStruct):
+        return _Unknown() if _is_unknown(value) else cast(jax.Array, value).item()
+    return value
 
 
 def _is_unknown(value: object) -> bool:
