@@ -35,7 +35,11 @@ COMMANDS = {
     ("names", "absent"),
     [
         (["jaxsense"], LEAN | SIMULATION | COMMANDS),
-        (["jaxsense.sim", "jaxsense.init", "jaxsense.make", "jaxsense.load"], COMMANDS),
+        pytest.param(
+            ["jaxsense.sim", "jaxsense.init", "jaxsense.make", "jaxsense.load"],
+            COMMANDS,
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_an_import_takes_no_longer_than_what_it_needs(names, absent):
@@ -67,29 +71,6 @@ def test_a_key_into_which_a_number_is_folded_is_used_for_nothing_else():
             if isinstance(node, ast.FunctionDef):
                 keys = {name for name in folded_and_used(node) if "key" in name}
                 assert not keys, f"{path}: {node.name}"
-
-
-def rows_of(heading: str) -> list[tuple[str, str]]:
-    """File and call of each row of a section's table."""
-    _, rest = PAGE.read_text().split(f"## {heading}\n")
-    lines = [line for line in rest.split("\n## ")[0].splitlines() if re.match(r"\| \d", line)]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    return [(file.strip("`"), call) for _, file, call in cells]
-
-
-@pytest.mark.parametrize(
-    ("heading", "most"),
-    [("From a LiDAR scan to the action", 14), ("From --jmvae.alpha to the loss", 9)],
-)
-def test_files_and_calls_of_the_page_exist(heading, most):
-    rows = rows_of(heading)
-    assert 0 < len(rows) <= most
-    for file, call in rows:
-        source = (PACKAGE / file).read_text()
-        names = [name.split(".")[-1] for name in re.findall(r"`([\w.]+)`", call)]
-        assert names
-        missing = [name for name in names if not re.search(rf"\b{name}\b", source)]
-        assert not missing, file
 
 
 def test_paths_of_the_page_exist():

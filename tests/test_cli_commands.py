@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from recordings import CONFIG, FUSION, recording
 from smoke import error_line
-from untrained import untrained
+from untrained import blank
 
 import jaxsense
 from jaxsense import __main__ as commands
@@ -120,7 +120,7 @@ class Player:
 
 @pytest.fixture(scope="module")
 def models():
-    return untrained(CONFIG)
+    return blank(CONFIG)
 
 
 @pytest.fixture
@@ -204,35 +204,6 @@ def test_the_demo_plays_a_mission_of_trained_robots(tmp_path):
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "here" / "demo.html").read_text()
     assert re.search(r'<th scope="row">latent</th>\s*<td>(<b>)?1\.000', text)
-
-
-@pytest.mark.slow  # installs hatchling, from a package index
-def test_wheel_and_sdist_run_without_the_source(tmp_path):
-    place = tmp_path / "environment"
-
-    def run(*command, **options):
-        done = subprocess.run(command, capture_output=True, text=True, check=False, **options)
-        assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-        return done.stdout
-
-    run(sys.executable, "-m", "venv", str(place))
-    python = str(place / "bin" / "python")
-    run(python, "-m", "pip", "install", "--quiet", "hatchling")
-    run(python, "-m", "hatchling", "build", "-d", str(tmp_path / "dist"), cwd=ROOT)
-    files = [*(tmp_path / "dist").iterdir()]
-    assert sorted(file.suffix for file in files) == [".gz", ".whl"]
-    for file in files:
-        target = tmp_path / file.suffix[1:]
-        install = [python, "-m", "pip", "install", "--quiet", "--no-deps", "--target"]
-        run(*install, str(target), str(file))
-        assert (target / "jaxsense" / "__init__.pyi").exists()
-        code = "import jaxsense; print(jaxsense.__file__, jaxsense.make('noisy-v0').name)"
-        away = {"cwd": tmp_path, "env": {"PYTHONPATH": str(target), "JAX_PLATFORMS": "cpu"}}
-        told = run(sys.executable, "-c", code, **away)
-        assert told == f"{target}/jaxsense/__init__.py noisy-v0\n"
-        version = f"jaxsense {jaxsense.__version__}\n"
-        for start in (["-m", "jaxsense"], [str(target / "bin" / "jaxsense")]):
-            assert run(sys.executable, *start, "--version", **away) == version
 
 
 @pytest.mark.parametrize(

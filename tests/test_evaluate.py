@@ -11,18 +11,14 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import jax
-import numpy as np
 import pytest
 from recordings import FIELDS_OF_VIEW, recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
-from jaxsense import dqn, evaluate, export, mission
+from jaxsense import dqn, evaluate, export
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.config.mission import CONTROL_PERIOD
-from jaxsense.run import cli, devices, missions, rundir
-from jaxsense.run.compilation import Compiler
-from jaxsense.run.monitor import Monitor
+from jaxsense.run import rundir
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.show import film
@@ -193,28 +189,6 @@ def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
         ElementTree.parse(path / "teams.svg").getroot().itertext()
     )
     assert "2 camera, 1 lidar" in (path / "report.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-def test_the_animation_shows_the_first_mission_that_was_evaluated(evaluated, cache):
-    path, _, _ = evaluated
-    config, models = jaxsense.load(path)
-    case = mission.cases(config)["latent"]
-    # The programs with which it was evaluated.
-    kept, workers = (
-        cli.keep_programs("jaxsense.evaluate", Path(cache[1]), config),
-        devices.start(None),
-    )
-    with Compiler(Monitor(), kept) as compiler:
-        player = missions.Player(mission.make_mission(config), compiler, 11, workers)
-        played = player.play(jax.random.key(0), models, {"latent": case}, 1)
-    found, recording = played.metrics["latent"], played.recording
-    np.testing.assert_array_equal(found["detections"][0], recording.records.detected.sum(axis=0))
-    seconds = recording.end.steps * CONTROL_PERIOD
-    assert found["time_s"][0] == pytest.approx(seconds)
-    drawn = ElementTree.fromstring((path / "mission-latent-0.svg").read_text())
-    texts = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}
-    assert {f"{seconds:.1f} s", "latent policy, seed 0"} <= texts
 
 
 def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):

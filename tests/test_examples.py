@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from smoke import save_models
+from untrained import blank, untrained
 
 import jaxsense
 from jaxsense import Belief, evaluate, train
@@ -42,7 +43,7 @@ def config():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(EXAMPLES)
         change = importlib.import_module("new_modality").change
-        return train.parse([*SMALL, *THERMAL], change).config
+        return train.parse([*SMALL, *THERMAL], change).settings.config
 
 
 def saved(path, config, models):
@@ -54,7 +55,7 @@ def saved(path, config, models):
 @pytest.fixture(scope="module")
 def run(config, tmp_path_factory):
     """The directory of a run with a thermal camera that has trained nothing."""
-    models = jaxsense.init(jax.random.key(0), config)
+    models = blank(config)
     return saved(tmp_path_factory.mktemp("runs") / "thermal", config, models)
 
 
@@ -72,7 +73,7 @@ def test_new_classes(example, tmp_path):
     assert summary["detectors"]["lidar"]["accuracy"] >= 0.8
     assert len(summary["jmvae"]["sigma_norm"]["lidar"]) == 4
     config, _ = jaxsense.load(tmp_path / "classes")
-    assert config == train.parse([*SMALL, *lidar], change).config
+    assert config == train.parse([*SMALL, *lidar], change).settings.config
     assert config.labels("camera") == ("blue", "orange")
 
 
@@ -84,7 +85,7 @@ def printed(name, capsys):
 
 def test_the_optimum_of_a_product_of_experts_is_that_of_looks_which_add_up(example, monkeypatch):
     config, key = PRESETS["smoke"], jax.random.key(0)
-    models = example("new_fusion").multiplying(jaxsense.init(key, config))
+    models = example("new_fusion").multiplying(untrained(config))
     mdp = jaxsense.make_mdp(config, models)
     monkeypatch.setattr(policies, "optimal", lambda key, models, known: "dynamic programming")
     found = reference(key, mdp, models, models.bayes.labels)

@@ -9,15 +9,15 @@ import os
 import shutil
 import sys
 
-import jax
 import numpy as np
 import pytest
 from flax import serialization
 from smoke import save_models
 from summaries import CASE, EVALUATION, RESULTS, SUMMARY
+from untrained import blank
 
 import jaxsense
-from jaxsense import evaluate, models
+from jaxsense import evaluate
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
@@ -40,17 +40,12 @@ CURVES = {"loss": np.ones(10, np.float32), "seconds": np.ones(4, np.float32)}
 TRAINING = {"state": STATE, "curves": CURVES}
 
 
-@functools.cache
-def shapes():
-    return jax.eval_shape(lambda: models.init(jax.random.key(0), CONFIG))
-
-
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     """A finished run that nobody has trained, with all its files, stopped in a training."""
     path = tmp_path_factory.mktemp("base") / "run"
     with RunDirectory.create(path, Settings("smoke", 0, CONFIG)) as run:
-        save_models(run, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes()))
+        save_models(run, blank(CONFIG))
         run.checkpoints.save("unfinished/dqn_camera", TRAINING)
         run.append_metrics(stage="jmvae", step=1, loss=0.5)
     (path / "summary.json").write_text(json.dumps(SUMMARY))
@@ -75,7 +70,7 @@ def resume(path):
     file = path / "summary.json"
     shutil.rmtree(file) if file.is_dir() else file.unlink()
     with RunDirectory.resume(path) as run:
-        run.checkpoints.load_or_forget("best_jmvae", shapes().jmvae, finite=True)
+        run.checkpoints.load_or_forget("best_jmvae", blank(CONFIG).jmvae, finite=True)
         run.checkpoints.load_or_forget("unfinished/dqn_camera", TRAINING)
         run.checkpoints.save("unfinished/dqn_camera", TRAINING)
         run.append_metrics(stage="jmvae", step=2, loss=0.5)

@@ -119,48 +119,29 @@ def test_a_damaged_file_is_traced_anew(tmp_path, damage, capsys):
     assert call(kept, never, ONE) == 2
 
 
-@pytest.fixture(scope="module")
-def two_processes(tmp_path_factory):
-    """What two processes print that use one directory, and how many compiled programs they keep.
+FACTORS = """
+import sys
+from pathlib import Path
+import jax, jax.numpy as jnp
+from jaxsense.run.compilation import Compiler, Kept, Program
+from jaxsense.run.monitor import Monitor
 
-    The second has been told to keep these elsewhere.
-    """
-    path = tmp_path_factory.mktemp("kept")
-    code = """if True:
-        import sys, jax, jax.numpy as jnp
-        from jaxsense.run.compilation import Compiler, Kept, Program, use_cache
-        from jaxsense.run.monitor import Monitor
-        from pathlib import Path
-        use_cache(Path(sys.argv[1]))
-        kept = Kept(Path(sys.argv[1]))
-        print("kept" if list(kept.path.iterdir()) else "new")
-        with Compiler(Monitor(), kept) as compiler:
-            program = Program(compiler, "stage", "run")
-            shape = jax.ShapeDtypeStruct((2, 2), jnp.float32)
-            program.compile(jnp.linalg.cholesky, shape)
-            print(program(jnp.array([[4.0, 2.0], [2.0, 5.0]])).tolist())
-        jax.jit(lambda x: int(sys.argv[2]) * x)(jnp.arange(3))  # new to each of them
-    """
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    said, compiled = [], []
-    for elsewhere in (None, path / "theirs"):
-        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        if elsewhere is not None:
-            environment["JAX_COMPILATION_CACHE_DIR"] = str(elsewhere)
-        own = path / "own"
-        before = set(own.glob("compiled/*-cache"))
-        command = [sys.executable, "-c", code, str(own), str(2 + len(said))]
-        ended = subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
-        said.append(ended.stdout)
-        compiled.append(len(set(own.glob("compiled/*-cache")) - before))
-    return said, compiled
+kept = Kept(Path(sys.argv[1]))
+print("kept" if list(kept.path.iterdir()) else "new")
+with Compiler(Monitor(), kept) as compiler:
+    program = Program(compiler, "stage", "run")
+    program.compile(jnp.linalg.cholesky, jax.ShapeDtypeStruct((2, 2), jnp.float32))
+    print(program(jnp.array([[4.0, 2.0], [2.0, 5.0]])).tolist())
+"""
 
 
 @pytest.mark.slow
-def test_a_kept_program_finds_the_functions_that_it_calls(two_processes):
+def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
     # Only a new process has not bound them yet. [[2, 0], [1, 2]] times its transpose is the matrix.
+    command = [sys.executable, "-c", FACTORS, str(tmp_path)]
+    said = [subprocess.check_output(command, text=True) for _ in range(2)]
     expected = "[[2.0, 0.0], [1.0, 2.0]]\n"
-    assert two_processes[0] == ["new\n" + expected, "kept\n" + expected]
+    assert said == ["new\n" + expected, "kept\n" + expected]
 
 
 def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypatch):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from untrained import blank, untrained
 
 import jaxsense
 from jaxsense import looks
@@ -27,7 +28,7 @@ NUM_LOOKS = 1024
 
 @pytest.fixture(scope="module")
 def models():
-    return jaxsense.init(jax.random.key(0), CONFIG)
+    return untrained(CONFIG)
 
 
 def numbered_bank():
@@ -78,7 +79,8 @@ def test_an_mdp_is_an_argument_of_jit(models):
     found, reset = [], jax.jit(mdps.reset)
     posterior = jax.jit(jmvae.posterior, static_argnums=1)
     for number in range(2):
-        other = jaxsense.init(jax.random.key(number), CONFIG)
+        jmvae_of = jax.tree.map(lambda x, n=number: (1 + n) * x, models.jmvae)
+        other = replace(models, jmvae=jmvae_of, fusion=replace(models.fusion, params=jmvae_of))
         mdp = looks.make_mdp(CONFIG, other, Bank(features))
         state = reset(jax.random.key(0), mdp, jnp.array([0, 1, 2]), np.zeros((3, 2), bool))
         belief, _ = gain(mdp, state)
@@ -90,7 +92,7 @@ def test_an_mdp_is_an_argument_of_jit(models):
 
 def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     config = replace(CONFIG, dqn=replace(CONFIG.dqn, task="team", hidden=(4,)))
-    mdp = looks.make_mdp(config, jaxsense.init(jax.random.key(0), config), Bank(numbered_bank()))
+    mdp = looks.make_mdp(config, blank(config), Bank(numbered_bank()))
     assert mdp.num_pois == config.team.num_pois[1]
     assert mdp.robots.tolist() == [0, 0, 1, 1]
     places = mdp.teams.places

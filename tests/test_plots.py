@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.collections import PatchCollection
 
 from jaxsense.config import PRESETS
-from jaxsense.core.types import Belief
 from jaxsense.show import colours, plots
 from jaxsense.sim import sensors
 from jaxsense.training.measures import reliability
@@ -87,34 +85,3 @@ def test_camera_and_lidar_are_drawn_from_left_to_right():
     # All distances on one scale.
     for ax in axes[:, 1]:
         assert ax.get_ylim() == (0.0, pytest.approx(1.05 * 0.8))
-
-
-CENTRES = np.array([[2.0, 0.0], [-2.0, 0.0], [-2.0, 0.05]])  # the last two look alike
-
-
-def posteriors():
-    noise = 0.01 * np.random.default_rng(0).normal(size=(3, 10, 2))
-    belief = Belief(CENTRES[:, None] + noise, np.full((3, 10, 2), 0.5))
-    return dict.fromkeys(("joint", "camera", "lidar"), belief)
-
-
-def test_classes_are_named_above_their_ellipses_and_seen_where_they_look_alike():
-    figure = plots.latent_space(CONFIG, posteriors())
-    figure.draw_without_rendering()
-    axes, below = figure.axes[0], figure.axes[3]
-    names = {text.get_text(): text for text in axes.texts}
-    assert set(names) == {"green cylinder", "red cylinder\nred cube"}
-    for text in names.values():
-        box = text.get_window_extent().transformed(axes.transData.inverted())
-        assert box.y0 > 0.5  # half an ellipse's height above the centre
-        assert box.y1 < axes.get_ylim()[1]
-    ellipses = [c for c in axes.collections if isinstance(c, PatchCollection)]
-    (green,), (red,), (cube,) = (each.get_linestyle() for each in ellipses)
-    assert green[1] is None  # solid, for it is alone
-    # Each draws where the other leaves gaps, of one length.
-    assert red[1][0] == red[1][1] == cube[1][0] == cube[1][1]
-    assert cube[0] - red[0] == red[1][0]
-    assert [label.get_text() for label in below.get_yticklabels()] == [*CONFIG.arena.classes]
-    for c, points in enumerate(each.get_offsets() for each in below.collections):
-        np.testing.assert_allclose(points[:, 0], np.sqrt(0.5))
-        assert np.abs(points[:, 1] - c).max() < 0.5

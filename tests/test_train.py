@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from smoke import MISSION_KEYS, SMOKE, error_line
-from untrained import untrained
+from untrained import blank
 
 import jaxsense
 from jaxsense import train
-from jaxsense.config import PRESETS, Config, Shape
-from jaxsense.config.options import docs
+from jaxsense.config import PRESETS, Shape
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.show import drawing
 from jaxsense.summary.blocks import cases
@@ -95,7 +94,7 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
     config, models = jaxsense.load(smoke_run)
     assert config == PRESETS["smoke"]
-    new = untrained(config)
+    new = blank(config)
     assert jax.tree.structure(models) == jax.tree.structure(new)
     kernel = models.jmvae["encoders"]["camera"]["params"]["Dense_0"]["kernel"]
     assert np.isfinite(kernel).all()
@@ -173,19 +172,3 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert (given.seed, given.preset, given.config.robots) == (7, "smoke", None)
     assert given.config.arena == dataclasses.replace(config.arena, side=5.0)
     assert resumed.settings == Settings("smoke", 7, config)
-
-
-def sections(section):
-    """A section, and those in it."""
-    yield section
-    for field in dataclasses.fields(section):
-        if dataclasses.is_dataclass(part := getattr(section, field.name)):
-            yield from sections(part)
-
-
-def test_every_setting_has_a_sentence_of_help():
-    assert len([*sections(Config())]) >= 16
-    for section in sections(Config()):
-        for field in dataclasses.fields(section):
-            is_section = dataclasses.is_dataclass(getattr(section, field.name))
-            assert is_section or docs(type(section))[field.name]

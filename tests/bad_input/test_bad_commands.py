@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
 from smoke import save_models
-from untrained import untrained
+from untrained import blank
 
 import jaxsense
 from benchmarks import __main__ as benchmarks
@@ -29,7 +29,7 @@ def run(tmp_path_factory):
     """The directory of a run that trained nothing, without a summary."""
     path = tmp_path_factory.mktemp("runs") / "run"
     with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
-        save_models(created, untrained(SMOKE))
+        save_models(created, blank(SMOKE))
     return path
 
 

@@ -2,10 +2,7 @@
 
 import dataclasses
 import json
-import os
 import pickle
-import subprocess
-import sys
 from itertools import count
 
 import jax
@@ -14,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import ANYTHING, FIELDS, NAN, NUMBERS, PARTS, SECTIONS, SMOKE, check_message
+from smoke import error_line
 
 from jaxsense import PRESETS, Attribute, Config, ConfigError, SensorConfig, Shape, learn
 from jaxsense.config import as_plain, from_plain
@@ -315,18 +313,11 @@ def test_settings_of_earlier_runs_load_with_the_values_of_the_constants():
 NO_64_BITS = "JAX_ENABLE_X64 = True: must be off, as jaxsense computes in 32 bits"
 
 
-def test_64_bits_are_refused(tmp_path):
+def test_64_bits_are_refused(tmp_path, monkeypatch, capsys):
     key = jax.random.key(0)
-    with jax.enable_x64(True), pytest.raises(ConfigError, match=f"^{NO_64_BITS}"):
-        learn(key, Config())
-    done = subprocess.run(
-        [sys.executable, "-m", "jaxsense.train"],
-        env={**os.environ, "JAX_ENABLE_X64": "1"},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    (line,) = (done.stdout + done.stderr).splitlines()
-    assert NO_64_BITS in line
+    monkeypatch.chdir(tmp_path)
+    with jax.enable_x64(True):
+        with pytest.raises(ConfigError, match=f"^{NO_64_BITS}"):
+            learn(key, Config())
+        assert NO_64_BITS in error_line([], capsys)
     assert not list(tmp_path.iterdir())

@@ -36,7 +36,3 @@ def test_a_value_of_a_wrong_type_is_named_in_one_line(name, value):
         )
     message = str(refused.value)
     assert any(message.startswith(p.name) for p in parameters) or repr(value)[1:-1] in message
-
-
-def test_there_are_many_wrong_calls():
-    assert len(FUNCTIONS) >= 40

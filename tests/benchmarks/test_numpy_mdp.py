@@ -11,6 +11,7 @@ from jaxsense.config import DqnConfig
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.agent import observation
 
+pytestmark = pytest.mark.slow
 TOLERANCE = 1e-5  # latent units, over a few float32 layers
 
 
@@ -20,7 +21,6 @@ def task():
     return untrained_task(DqnConfig(observe="bank"), samples=1)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("modality", [0, 1])
 def test_every_step_equals_ours(task, modality):
     mdp = task.mdp

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import pytest
 from exporting import CONFIG
 from smoke import save_models
+from untrained import untrained
 
 from jaxsense import export
 from jaxsense.core.types import Belief
-from jaxsense.models import init, make_in_place
+from jaxsense.models import make_in_place
 from jaxsense.run.rundir import RunDirectory, Settings
 from jaxsense.vae.novelty import Novelty
 
@@ -16,11 +17,11 @@ from jaxsense.vae.novelty import Novelty
 @pytest.fixture(scope="session")
 def models():
     """Models, with classes at random places in the latent space."""
-    untrained = init(jax.random.key(0), CONFIG)
-    means = jax.random.normal(jax.random.key(1), untrained.fusion.classes.mean.shape)
+    found = untrained(CONFIG)
+    means = jax.random.normal(jax.random.key(1), found.fusion.classes.mean.shape)
     return dataclasses.replace(
-        untrained,
-        fusion=make_in_place(CONFIG, untrained.jmvae, Belief(means, jnp.ones_like(means))),
+        found,
+        fusion=make_in_place(CONFIG, found.jmvae, Belief(means, jnp.ones_like(means))),
         novelty=Novelty(jnp.array([5.0, 20.0]), jnp.array([0.3, 0.9])),
     )
 

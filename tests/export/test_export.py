@@ -1,6 +1,5 @@
 """The command `export`, and the example that plays its file without jaxsense and JAX."""
 
-import re
 import shutil
 import subprocess
 import sys
@@ -73,20 +72,3 @@ def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
     assert line == f"jaxsense.export: {package} is not installed: pip install 'jaxsense[export]'"
     assert not [*tmp_path.iterdir()]
-
-
-@pytest.mark.parametrize("problem", ["run", "out", "folder"])
-def test_bad_input_is_one_line_and_overwrites_nothing(run, tmp_path, capsys, problem):
-    existing = tmp_path / "precious.zip"
-    existing.write_text("precious")
-    argv, expected = {
-        "run": (
-            [str(tmp_path / "no_run")],
-            "no_run': is not a run directory: it has no ",
-        ),
-        "out": ([str(run), "--out", str(existing)], "out = .*already exists; must be a new file"),
-        "folder": ([str(run), "--out", str(tmp_path / "no" / "x.zip")], "out = .*cannot be writ"),
-    }[problem]
-    assert re.search(expected, error_line(argv, capsys, export))
-    assert existing.read_text() == "precious"
-    assert list(tmp_path.iterdir()) == [existing]

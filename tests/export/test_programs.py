@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 from exporting import CONFIG, drawn
+from untrained import untrained
 
 import jaxsense
 from jaxsense import export
@@ -138,7 +139,7 @@ def test_contents_describe_what_is_there(models, file, loaded):
     assert (limits["min_distance"], limits["max_distance"]) == (0.3, 1.2)
     assert limits["max_bearing"] == pytest.approx(np.radians(20), abs=1e-6)
     assert contents["versions"] == {"jaxsense": __version__}
-    unseen = export._description(CONFIG, jaxsense.init(jax.random.key(0), CONFIG))["unseen"]
+    unseen = export._description(CONFIG, untrained(CONFIG))["unseen"]
     assert unseen == {"mean": [0.0, 0.0], "std": pytest.approx([20.0**0.5] * 2)}
     json.dumps(unseen)
 
@@ -163,7 +164,7 @@ def models_of(config):
         is_real = isinstance(x, jax.Array) and x.dtype == np.float32
         return x + np.float32(rng.uniform(0.05, 0.5, x.shape)) if is_real else x
 
-    return jax.tree.map(moved, jaxsense.init(jax.random.key(0), config))
+    return jax.tree.map(moved, untrained(config))
 
 
 @pytest.mark.slow  # compiles every program of each

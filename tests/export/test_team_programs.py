@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from exporting import CONFIG, EXAMPLE, drawn
+from untrained import untrained
 
-import jaxsense
 from jaxsense import export
 from jaxsense.config import PRESETS
 from jaxsense.config.mission import CommunicationConfig
@@ -42,7 +42,7 @@ def team():
     """Models of a team with tours, and their archive."""
     dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
     config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
-    trained = jaxsense.init(jax.random.key(0), config)
+    trained = untrained(config)
     return trained, load(io.BytesIO(export.archive(config, trained)))
 
 
@@ -79,7 +79,7 @@ def test_a_team_may_have_any_number_of_points_and_robots(team, example):
 @pytest.fixture(scope="module")
 def models():
     """Models with a filter that says different things of different features."""
-    found = jaxsense.init(jax.random.key(0), OWN)
+    found = untrained(OWN)
     classes = Belief(jnp.array([[1.5, 0.0], [-1.0, 1.2], [-0.8, -1.4]]), jnp.full((3, 2), 0.3))
     fusion = found.fusion
     read = readout.make(classes, fusion.model.feature_sizes)

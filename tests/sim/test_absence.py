@@ -18,12 +18,12 @@ NUM_LOOKS = 400
 CAMERA, LIDAR = 0, 1
 
 
-@pytest.fixture(scope="module")
-def looks():
-    """Changed looks at the first PoI, and of the rays of each window hits and angles."""
-    simulation = world.make_world(CONFIG)
+@pytest.fixture(scope="module", params=[pytest.param(CAMERA, marks=pytest.mark.slow), LIDAR])
+def looks(request):
+    """A robot, changed looks at the first PoI, and of each window's rays hits and angles."""
+    robot, simulation = request.param, world.make_world(CONFIG)
 
-    def look(key, robot):
+    def look(key):
         scene_key, look_key, change_key = jax.random.split(key, 3)
         scene = world.random_scene(scene_key, simulation, jnp.array([0, 1, 2]))
         _, scene = world.look(look_key, simulation, scene, robot, jnp.int32(0))
@@ -51,14 +51,11 @@ def looks():
         return before, view, is_poi, angles
 
     keys = jax.random.split(jax.random.key(0), NUM_LOOKS)
-    return [
-        jax.device_get(jax.jit(jax.vmap(lambda key, r=r: look(key, r)))(keys)) for r in range(2)
-    ]
+    return robot, *jax.device_get(jax.jit(jax.vmap(look))(keys))
 
 
-@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks, robot):
-    _, view, is_poi, angles = looks[robot]
+def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks):
+    _, _, view, is_poi, angles = looks
     away = viewpoints.outside(CONFIG.arena)
     has_twin = np.any(view.twin != away, axis=-1)
     is_middle = np.abs(angles - view.bearing[:, None]) < np.radians(1.0)
@@ -68,9 +65,8 @@ def test_no_changed_look_shows_its_poi_in_the_middle_of_the_window(looks, robot)
     assert shows[has_twin].any()
 
 
-@pytest.mark.parametrize("robot", [CAMERA, LIDAR])
-def test_every_situation_is_drawn(looks, robot):
-    before, view, _, _ = looks[robot]
+def test_every_situation_is_drawn(looks):
+    robot, before, view, _, _ = looks
     away = viewpoints.outside(CONFIG.arena)
     inside = np.abs(view.poses[:, robot, :2]).max(axis=-1) < CONFIG.arena.side / 2
     moved = np.any(view.poses[:, robot] != before.poses[:, robot], axis=-1)

@@ -91,7 +91,7 @@ LIDAR = LidarConfig(range_noise=0.001, mixed_pixels=0.5, dropout=0.05, window=12
 @pytest.mark.parametrize(
     ("sensor", "bearing"),
     [
-        (sensors.camera(CAMERA), 0.1),
+        pytest.param(sensors.camera(CAMERA), 0.1, marks=pytest.mark.slow),
         # The cylinder ahead ends with beam 373, at .2 rad.
         (sensors.lidar(LIDAR), 0.172),
     ],

@@ -33,10 +33,8 @@ def test_models_have_the_settings_of_their_preset(preset):
     assert {"jaxsense", "jax", "python"} <= set(made.versions)
 
 
-@pytest.mark.parametrize(
-    "preset",
-    [p if p == "default" else pytest.param(p, marks=pytest.mark.slow) for p in tasks.PRETRAINED],
-)
+@pytest.mark.slow  # simulates looks
+@pytest.mark.parametrize("preset", tasks.PRETRAINED)
 def test_models_tell_classes_apart(preset):
     """Looks by all sensors at a PoI of each class, from the detectors to the map."""
     config, models = jaxsense.load_pretrained(preset)

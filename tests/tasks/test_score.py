@@ -45,22 +45,16 @@ def optimum_of_eight():
         return registry.reference_returns(jaxsense.make(NAME), 1, 8)["optimal"]
 
 
-@pytest.fixture(scope="module")
-def of_eight():
-    return optimum_of_eight()
+SETTINGS = {
+    "jax_threefry_partitionable": False,
+    "jax_random_seed_offset": 1,
+    "jax_default_prng_impl": "rbg",
+}
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"jax_threefry_partitionable": False, "jax_random_seed_offset": 1},
-        {"jax_default_prng_impl": "rbg"},
-        pytest.param({"jax_default_prng_impl": "unsafe_rbg"}, marks=pytest.mark.slow),
-    ],
-)
-def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform, of_eight, settings):
-    usual = {name: getattr(jax.config, name) for name in settings}
-    for name, value in settings.items():
+def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform):
+    of_eight, usual = optimum_of_eight(), {name: getattr(jax.config, name) for name in SETTINGS}
+    for name, value in SETTINGS.items():
         jax.config.update(name, value)
     try:
         found = jaxsense.score(NAME, [uniform])

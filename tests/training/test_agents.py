@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny import KEY, TINY, inputs_of, stage_of
+from untrained import untrained
 
-from jaxsense import models
 from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief
 from jaxsense.dqn import training as dqn
@@ -53,7 +53,7 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward()
 
 @pytest.mark.parametrize("name", ["dqn_camera", "dqn_lidar"])
 def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(monkeypatch, name):
-    untrained = models.init(KEY, BANK)
+    models = untrained(BANK)
     bank, held_out = (tuple(jnp.full((3, 4, 2), x) for _ in range(2)) for x in (0.5, 0.25))
     used = {}
 
@@ -77,9 +77,9 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
     found = {
         "starts": None,
-        "fusion": untrained.fusion,
+        "fusion": models.fusion,
         "detections": detections_of(bank, held_out, starts),
-        **dict(zip(("detector_camera", "detector_lidar"), untrained.detectors, strict=True)),
+        **dict(zip(("detector_camera", "detector_lidar"), models.detectors, strict=True)),
     }
     inputs = inputs_of(name, BANK, found)
     _, progress = stage.advance(KEY, BANK, "state", **inputs)

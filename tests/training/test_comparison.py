@@ -5,7 +5,6 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from by_hand import CONFIG, EXACT, KEY, detections, in_place
 
 from jaxsense.config.learning import EvaluationConfig
@@ -30,9 +29,7 @@ def constant(gain):
     return LookValues(table, table, *(jnp.float32(gain),) * 2)
 
 
-@pytest.fixture(scope="module")
-def same_policy():
-    """Totals and first rewards of four times the same policy, by the number of repeats."""
+def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch):
     # Looks at a class are all different: what differs is their noise.
     always = policies.Policy(lambda key, models, known: jnp.array([1.0, 0.0, 0.0, 0.0]))
     bank = tuple(
@@ -42,29 +39,22 @@ def same_policy():
     q_networks = (with_bias(jnp.zeros(4)),) * 2
     models = models_of(CONFIG, in_place(), (constant(1.0),) * 2, q_networks)
 
+    settings = EvaluationConfig(num_starts=4, num_repeats=1, num_states=8)
+    config = replace(CONFIG, evaluation=settings)
+
     @jax.jit
-    def compared(models, config):
+    def compared(models):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank), 0)
         return comparison.compare_policies(
             KEY, models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
         )
 
-    def found(repeats):
-        settings = EvaluationConfig(num_starts=4, num_repeats=repeats, num_states=8)
-        return compared(models, replace(CONFIG, evaluation=settings))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
-        patch.setattr(
-            comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
-        )
-        names = *comparison.COMPARED, "mine"
-        of_repeats = {n: found(n) for n in (1, 2, 9)}
-        return {n: np.array([by_name[name] for name in names]) for n, by_name in of_repeats.items()}
-
-
-def test_policies_are_compared_on_the_same_starts_and_the_same_looks(same_policy):
-    found = same_policy[1]
+    monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
+    monkeypatch.setattr(
+        comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
+    )
+    by_name = compared(models)
+    found = np.array([by_name[name] for name in (*comparison.COMPARED, "mine")])
     assert found.shape == (6, 2, 12)  # with one of our own
     assert len(np.unique(found[0, 0])) > 6  # of 12; without a gain a look is worth -1
     np.testing.assert_array_equal(found, found[[0] * 6])

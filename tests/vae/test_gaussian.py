@@ -1,4 +1,4 @@
-"""Divergence, sampling and moment matching against hand-worked numbers and Monte Carlo."""
+"""Divergence, sampling and moment matching against hand-worked numbers."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -22,21 +22,6 @@ def test_kl_of_each_dimension_adds_up_as_worked_by_hand():
     np.testing.assert_allclose(gaussian.kl_divergence(*p, *q), 1.306853 + 0.818147, rtol=1e-5)
     # Turned round: (1/4 + 1/4 - 1 + ln 4) / 2 = 0.443147, (4 + 4 - 1 - ln 4) / 2 = 2.806853.
     np.testing.assert_allclose(gaussian.kl_divergence(*q, *p), 0.443147 + 2.806853, rtol=1e-5)
-
-
-def test_kl_is_the_mean_log_ratio_of_the_densities():
-    mean_p, std_p = np.array([0.5, -1.0, 2.0]), np.array([0.7, 1.5, 0.2])
-    mean_q, std_q = np.array([0.0, 0.5, 1.9]), np.array([1.1, 1.0, 0.3])
-    z = mean_p + std_p * np.random.default_rng(0).standard_normal((200_000, 3))
-
-    def log_density(mean, std):  # without the constant, which cancels
-        return np.sum(-0.5 * ((z - mean) / std) ** 2 - np.log(std), axis=-1)
-
-    ratios = log_density(mean_p, std_p) - log_density(mean_q, std_q)
-    standard_error = ratios.std() / np.sqrt(len(ratios))
-    inputs = (mean_p, 2 * np.log(std_p), mean_q, 2 * np.log(std_q))
-    kl = gaussian.kl_divergence(*(jnp.array(x, jnp.float32) for x in inputs))
-    np.testing.assert_allclose(kl, ratios.mean(), atol=4 * standard_error)
 
 
 def test_moment_match_as_worked_by_hand():

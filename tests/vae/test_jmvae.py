@@ -1,12 +1,10 @@
 """The JMVAE's encoders, decoders, loss, training and likelihood."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
+from plain import dense, encode, looks, random_params
 from scipy.stats import multivariate_normal
 
 from jaxsense.config import JmvaeConfig
@@ -17,17 +15,7 @@ TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
 THREE = Jmvae(("camera", "lidar", "sonar"), (2, 3, 1), latent_size=4, hidden=(8,))
 
 
-init = jax.jit(jmvae.init, static_argnums=1)
-encode = jax.jit(jmvae.encode, static_argnums=1)
 losses = jax.jit(jmvae.losses, static_argnums=2)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def some_features(model, seed=0):
-    keys = jax.random.split(jax.random.key(seed), len(model.modalities))
-    return tuple(
-        jax.random.uniform(k, (n,)) for k, n in zip(keys, model.feature_sizes, strict=True)
-    )
 
 
 def keep(features, subset):
@@ -35,7 +23,7 @@ def keep(features, subset):
 
 
 def zero_parameters(model):
-    return jax.tree.map(np.zeros_like, init(jax.random.key(0), model))
+    return jax.tree.map(np.zeros_like, random_params(jmvae.init, model))
 
 
 def with_output(params, name, output):
@@ -52,12 +40,12 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     params = with_output(params, "camera", [1.0, np.log(0.5)])
     params = with_output(params, "lidar", [3.0, np.log(0.25)])
     assert params["encoders"].keys() == {"camera", "lidar", "sonar", "camera+lidar+sonar"}
-    mean, log_var = encode(params, model, keep(some_features(model), (0, 1)))
+    mean, log_var = jmvae.encode(params, model, keep(looks(model), (0, 1)))
     # The prior has precision 1, camera adds 1 and LiDAR 3: (2 x 1 + 4 x 3) / (1 + 1 + 3).
     np.testing.assert_allclose(mean, [14 / 5], rtol=1e-6)
     np.testing.assert_allclose(log_var, [-np.log(5)], rtol=1e-6)
     options = {"alpha": 1.0, "beta": 1.0, "reconstruction_weights": (1.0,) * 3}
-    columns = tuple(x[:, None] for x in some_features(model))
+    columns = tuple(x[:, None] for x in looks(model))
     _, parts = losses(jnp.zeros((1, 1)), params, model, columns, **options)
     # KL(N(0, 1) || N(m, v)) = (1/v + m^2/v - 1 + ln v) / 2 for camera and LiDAR, 0 for the sonar.
     expected = (2 + 2 - 1 - np.log(2)) / 2 + (4 + 36 - 1 - np.log(4)) / 2
@@ -66,10 +54,7 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
 
 def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
     params = with_output(zero_parameters(TWO), "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
-    features = keep(some_features(TWO), (1,))
-    mean, log_var = encode(params, TWO, features)
-    np.testing.assert_allclose(mean, [1.0, 2.0])
-    np.testing.assert_allclose(log_var, [1.386294, 0.0], rtol=1e-5)
+    features = keep(looks(TWO), (1,))
     belief = jmvae.posterior(params, TWO, features)
     np.testing.assert_allclose(belief.mean, [1.0, 2.0])
     np.testing.assert_allclose(belief.std, [2.0, 1.0], rtol=1e-6)  # exp(ln(4) / 2) = 2
@@ -127,26 +112,10 @@ BATCH = 6
 @pytest.fixture(scope="module")
 def example():
     """Parameters, all of them random, noise, features and what `losses` makes of them."""
-    keys = jax.random.split(jax.random.key(0), 4)
-    params = jmvae.init(keys[0], MODEL)
-    flat, unravel = ravel_pytree(params)
-    # Biases of zero would hide where they are added.
-    params = unravel(flat + 0.3 * jax.random.normal(keys[1], flat.shape))
-    noise = jax.random.normal(keys[2], (MODEL.latent_size, BATCH))
-    features = tuple(
-        jax.random.uniform(k, (size, BATCH))
-        for k, size in zip(jax.random.split(keys[3]), MODEL.feature_sizes, strict=True)
-    )
+    rng, params = np.random.default_rng(0), random_params(jmvae.init, MODEL)
+    noise = rng.normal(size=(MODEL.latent_size, BATCH)).astype(np.float32)
+    features = tuple(rng.uniform(size=(n, BATCH)).astype(np.float32) for n in MODEL.feature_sizes)
     return params, noise, features, losses(noise, params, MODEL, features, **OPTIONS)
-
-
-def dense(params, x):
-    """Layers with ReLU between them, in double precision."""
-    layers = [params["params"][f"Dense_{i}"] for i in range(3)]
-    for i, layer in enumerate(layers):
-        x = np.asarray(layer["kernel"], np.float64).T @ x + np.asarray(layer["bias"])
-        x = np.maximum(x, 0) if i < 2 else x
-    return x
 
 
 def kl(mean, variance, mean_q, variance_q):
@@ -161,11 +130,8 @@ def test_every_term_is_that_of_the_equation(example):
     for i in range(BATCH):
         x, w = (np.asarray(f[:, i], np.float64) for f in features)
         joint, camera, lidar = (
-            np.split(dense(params["encoders"][name], v), 2)
-            for name, v in (
-                ("camera+lidar", np.concatenate([x, w])), ("camera", x), ("lidar", w)
-            )
-        )  # fmt: skip
+            encode(params, MODEL, given) for given in ((x, w), (x, None), (None, w))
+        )
         mean, variance = joint[0], np.exp(joint[1])
         z = mean + np.sqrt(variance) * np.asarray(noise[:, i])
         # -log N(x; decoded, 1) without the constant.
@@ -192,16 +158,16 @@ estimate = jax.jit(jmvae.log_likelihood, static_argnames=("model", "samples"))
 
 @pytest.fixture(scope="module")
 def params():
-    return jmvae.init(jax.random.key(0), LINEAR)
+    return random_params(jmvae.init, LINEAR)
 
 
 def exact(params, present):
     """Features of linear decoders are normal: their moments follow from those of the latents."""
-    offset = jmvae.decode(params, LINEAR, jnp.zeros(2))
-    jacobian = jax.jacobian(lambda z: jmvae.decode(params, LINEAR, z))(jnp.zeros(2))
-    w = np.concatenate([jacobian[m] for m in present])
+    layers = [params["decoders"][name]["params"]["Dense_0"] for name in LINEAR.modalities]
+    w = np.concatenate([layers[m]["kernel"].T for m in present])
     noise = np.concatenate([np.full(len(FEATURES[m]), 1 / WEIGHTS[m]) for m in present])
-    x, mean = (np.concatenate([of[m] for m in present]) for of in (FEATURES, offset))
+    mean = np.concatenate([layers[m]["bias"] for m in present])
+    x = np.concatenate([FEATURES[m] for m in present])
     return multivariate_normal.logpdf(x, mean, w @ w.T + np.diag(noise))
 
 
