@@ -85,6 +85,7 @@ def run_episode(
       action.
     """
     policy_key, looks_key = jax.random.split(key)
+    before = start.state.seen.astype(jnp.int32)
 
     def play(carry: _Carry) -> _Carry:
         state, looks = carry.state, carry.looks
@@ -94,7 +95,7 @@ def run_episode(
         policy = jax.random.fold_in(policy_key, state.steps)
         action, memory = act(policy, known, carry.memory)
         if mdp.teams is None:
-            own = jnp.sum(looks - start.state.seen, axis=1).at[action].get(mode="clip")
+            own = jnp.sum(looks - before, axis=1).at[action].get(mode="clip")
             look_key = jax.random.fold_in(jax.random.fold_in(looks_key, action), own)
         else:
             look_key = jax.random.fold_in(looks_key, state.steps)
@@ -121,7 +122,7 @@ def run_episode(
 
     carry = _Carry(
         state=start.state,
-        looks=start.state.seen.astype(jnp.int32),
+        looks=before,
         log_likelihood=start.log_likelihood,
         memory=memory,
         done=jnp.bool_(False),

@@ -41,20 +41,6 @@ def test_a_linear_classifier_by_hand():
     np.testing.assert_array_equal(labels(np.array([[0.9, 5.0], [1.1, 5.0]])), [0, 1])
 
 
-def test_the_table_shows_means_and_intervals():
-    runs = {
-        "ours": [{"accuracy all": 0.3, "seconds": 2.0}, {"accuracy all": 0.5, "seconds": 2.0}],
-        "theirs": [{"accuracy all": 0.3, "seconds": 8.0}, {"accuracy all": 0.3, "seconds": 8.5}],
-    }
-    # Standard errors .1 and .25, and t = 12.706 for 1 degree of freedom.
-    assert digits.table(runs).splitlines() == [
-        "| | ours | theirs |",
-        "| --- | --- | --- |",
-        "| accuracy all | 0.400 ± 1.271 | 0.300 |",
-        "| seconds | 2.0 | 8.2 ± 3.2 |",
-    ]
-
-
 def check(params, data):
     found = digits.figures(jax.random.key(0), params, data, BUDGET, samples=20)
     accuracies = [f"accuracy {name}" for name in ("all", *data.names)]

@@ -14,16 +14,6 @@ import jaxsense
 from benchmarks import dqn, peers, scoreboard
 
 make = functools.cache(jaxsense.make)
-ROW = {
-    "task": "map-v0",
-    "agent": "camera",
-    "policy": "mine",
-    "returns": [1.0, 1.0, 1.0],
-    "best": "optimal",
-    "best_returns": [2.0, 2.0, 2.0],
-    "steps": 131072,
-    "seconds": 12.345,
-}
 
 
 def peer(name, package):
@@ -147,17 +137,3 @@ def test_a_row_holds_all_seeds_and_its_origin():
     assert (row["settings"], row["steps"]) == ({"process": 7}, 64)
     assert row["about"]["command"] == "python -m x"
     json.dumps(row, allow_nan=False)
-
-
-def test_tables_show_what_learners_reach():
-    other = {**ROW, "task": "many-v0", "returns": [1.0, 3.0, 2.0]}
-    lines = scoreboard.tables([ROW, other]).splitlines()
-    assert lines[:5] == [
-        "### `map-v0`, `camera`",
-        "",
-        "| policy | fraction of `optimal` | CPU seconds | environment steps |",
-        "| --- | --- | --- | --- |",
-        "| mine | 0.500 (0.500 to 0.500) | 12.3 | 131,072 |",
-    ]
-    assert lines[6] == "### `many-v0`, `camera`"
-    assert lines[-1].startswith("| mine | 1.000 (0.")
