@@ -38,11 +38,11 @@ def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
     assert of_uniform.best == "optimal"
 
 
-def optimum_of_eight():
-    """Return of the optimum in eight episodes, played without the other references."""
+def random_of_eight():
+    """Return of the random reference in eight episodes, played without the others."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Task, "references", ("optimal",))
-        return registry.reference_returns(jaxsense.make(NAME), 1, 8)["optimal"]
+        patch.setattr(Task, "references", ("random",))
+        return registry.reference_returns(jaxsense.make(NAME), 1, 8)["random"]
 
 
 SETTINGS = {
@@ -53,12 +53,12 @@ SETTINGS = {
 
 
 def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform):
-    of_eight, usual = optimum_of_eight(), {name: getattr(jax.config, name) for name in SETTINGS}
+    of_eight, usual = random_of_eight(), {name: getattr(jax.config, name) for name in SETTINGS}
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
     try:
         found = jaxsense.score(NAME, [uniform])
-        played = optimum_of_eight()
+        played = random_of_eight()
     finally:
         for name, value in usual.items():
             jax.config.update(name, value)
@@ -78,7 +78,7 @@ def test_a_changed_task_has_no_score_under_its_name(reward):
 
 
 def test_a_task_with_a_name_of_its_own_is_compared_in_itself(monkeypatch):
-    monkeypatch.setattr(Task, "references", ("optimal",))  # the others take time
+    monkeypatch.setattr(Task, "references", ("random",))  # the others take time
     task = jaxsense.make("noisy-v0")
     named = dataclasses.replace(with_reward(task, dqn.Nats(0.2)), name="mine")
     found = jaxsense.score(named, [nop])

@@ -1,6 +1,7 @@
 """A JMVAE that learns from scans: groups of looks, and labels that only name what it has found."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -37,11 +38,15 @@ def stages_of(config: Config) -> dict[str, Stage]:
     return {stage.name: stage for stage in training.stages.stages(config)}
 
 
-def begun(stage: Stage, config: Config, outputs) -> Any:
-    """What a stage begins with, in one program."""
-    key = stage.key(KEY)
-    inputs = inputs_of(stage.name, config, outputs)
-    return jax.jit(lambda inputs: stage.begin(key, config, **inputs))(inputs)
+@functools.cache
+def beginning(name: str):
+    """A stage's `begin`, in one program for all inputs."""
+    stage = stages_of(TINY)[name]
+    return jax.jit(lambda inputs: stage.begin(stage.key(KEY), TINY, **inputs))
+
+
+def begun(name: str, outputs) -> Any:
+    return beginning(name)(inputs_of(name, TINY, outputs))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +93,7 @@ def test_no_label_enters_the_training(learned):
     training = dataclasses.replace(training, classes=(training.classes + 1) % 3)
     other = dataclasses.replace(surveys, training=training)
     both = surveys, other
-    views = [begun(stages_of(TINY)["views"], TINY, {"survey": s}) for s in both]
+    views = [begun("views", {"survey": s}) for s in both]
     for one, two in zip(*map(jax.tree.leaves, views), strict=True):
         np.testing.assert_array_equal(one, two)
     params = learned.outputs["best_jmvae"]
@@ -104,16 +109,16 @@ def test_no_label_enters_the_training(learned):
 
 def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypatch):
     """A PoI that looks like another class goes there, whatever its label."""
-    outputs, listed = learned.outputs, stages_of(TINY)
+    outputs = learned.outputs
     num_bank = num_scenes(TINY)[1]
     shown = jnp.arange(num_bank * TINY.arena.num_pois).reshape(num_bank, -1) % 3
     monkeypatch.setattr(looks, "features", lambda trained, windows, distances: tuple(
         jnp.concatenate([shown, jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9)])[..., None]
         for w in windows
     ))  # fmt: skip
-    stage, taken_for = listed["detections"], Shown(outputs["shown"].calibrating, bank=shown)
+    taken_for = Shown(outputs["shown"].calibrating, bank=shown)
     untrained = {"detector_camera": (), "detector_lidar": ()}
-    found = begun(stage, TINY, {**outputs, **untrained, "shown": taken_for})
+    found = begun("detections", {**outputs, **untrained, "shown": taken_for})
     for bank in found.bank:
         np.testing.assert_array_equal(bank[..., 0], np.repeat([[0], [1], [2]], 12, axis=1))
 
