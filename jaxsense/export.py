@@ -9,6 +9,7 @@ scans of other sensors into those that `detect` reads.
 import io
 import json
 import math
+import os
 import sys
 import zipfile
 from collections.abc import Callable
@@ -326,11 +327,10 @@ def main(argv: list[str] | None = None) -> None:
         config, models = rundir.load(run, arguments.trust)
         preset = str(run).removeprefix(PREFIX)
         path = path or (run / "exported.zip" if is_run else Path(f"{preset}.zip"))
-        if path.exists():
+        # Before seconds of work.
+        if path.name in os.listdir(path.parent):
             raise ConfigError("out", str(path), "already exists; must be a new file")
-        if not path.parent.is_dir():
-            raise ConfigError("out", str(path), "cannot be written (Not a directory)")
-        files.write(path, content := archive(config, models))
+        files.write(path, content := archive(config, models), is_new=True)
     except (ValueError, ModuleNotFoundError, NotImplementedError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:

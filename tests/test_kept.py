@@ -144,6 +144,15 @@ def test_a_kept_program_finds_the_functions_that_it_calls(tmp_path):
     assert said == ["new\n" + expected, "kept\n" + expected]
 
 
+def test_a_program_is_told_from_others_by_what_it_closes_over(tmp_path):
+    kept = Kept(tmp_path)
+    for factor in (2, 3, 2):
+        found = kept.find_or_trace("stage", lambda x, f=factor: f * x, (ONE,), ("factor", factor))
+        assert found is not None
+        assert found(ONE) == factor
+    assert len([*kept.path.iterdir()]) == 2
+
+
 def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypatch):
     kept = Kept(tmp_path)
     names = "mission-go_on", "detector_Wärme-begin", "policies_lidar-begin", "jmvae-advance"

@@ -1,4 +1,4 @@
-"""Settings as options of a command line: fields of dataclasses, whose docstring is the help."""
+"""Settings as options of a command line: fields of dataclasses, described by the class."""
 
 import contextlib
 import dataclasses
@@ -70,7 +70,7 @@ class Option:
 
     @property
     def help(self) -> str:
-        """The field's docstring; of an entry of a dictionary, that of the dictionary."""
+        """The field's description; of an entry of a dictionary, that of the dictionary."""
         known = docs(self.section)
         text = next((known[field] for field in reversed(self.path) if field in known), "")
         return text.replace("`", "")
@@ -279,7 +279,7 @@ def _metavar(option: Option) -> str:
 
 
 def _text(option: Option) -> str:
-    """An option's docstring and default value."""
+    """An option's description and default value."""
     value = option.default
     if value is True:
         return f"{option.help} (default: on; {option.off} turns it off)"

@@ -39,8 +39,9 @@ def made(kind: Any, stored: object, base: object = None, place: str = "") -> obj
     kinds, given, former = get_type_hints(kind), {}, {}
     for name, value in stored.items():
         path = f"{place}.{name}".lstrip(".")
-        if value in FORMER.get(path, ()):
-            former[name] = value
+        plain = [*value] if isinstance(value, tuple) else value  # as JSON has it
+        if plain in FORMER.get(path, ()):
+            former[name] = plain
         elif name not in kinds:
             raise ConfigError(path, value, _unknown(path))
         else:

@@ -58,6 +58,8 @@ class ConfigError(ValueError):
 
 def _shown(value: object) -> str:
     """A value in one short line; a function by its name."""
+    while isinstance(value, functools.partial):
+        value = value.func
     if callable(value):
         return getattr(value, "__name__", type(value).__name__)
     try:
@@ -173,8 +175,11 @@ def check_fields(section: object) -> None:
             object.__setattr__(section, name, _converted(value, kind, limits))
         except TypeError:
             expected = f"must be {described(kind, limits)}"
-            if isinstance(value, int | float) and not _fits(value, is_whole=isinstance(value, int)):
-                expected += ", within 32 bits"
+            numbers = [x for x in jax.tree.leaves(value) if isinstance(x, int | float)]
+            if not all(_fits(x, is_whole=True) for x in numbers if isinstance(x, int)):
+                expected += ", below 2^31"
+            if not all(_fits(x, is_whole=False) for x in numbers if isinstance(x, float)):
+                expected += ", 0 or of magnitude 1e-30 to 1e+30"
             raise ConfigError(_place(section, name), value, expected) from None
 
 
@@ -206,7 +211,7 @@ def _converted(value: object, kind: object, limits: Limits, is_leaf: bool = Fals
             return FrozenDict({n: _converted(x, inner[1], limits) for n, x in value.items()})
     elif origin is None:
         return _scalar(value, cast(type, kind), limits, is_leaf)
-    elif origin is Literal and any(value == x and type(value) is type(x) for x in inner):
+    elif origin is Literal and any(type(value) is type(x) and value == x for x in inner):
         return value
     raise TypeError
 

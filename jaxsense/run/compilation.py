@@ -23,6 +23,7 @@ from jax import export
 from jax.sharding import Mesh
 from jaxtyping import PyTree
 
+from jaxsense.config import ConfigError
 from jaxsense.run import devices, files, version
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor
@@ -98,13 +99,16 @@ class Kept:
                 path.unlink()
             files.remove_unfinished(self.path)
 
-    def find_or_trace(self, name: str, function: Function, args: PyTree) -> Traced | None:
+    def find_or_trace(
+        self, name: str, function: Function, args: PyTree, closed: object = ()
+    ) -> Traced | None:
         """Finds a cached program, or traces and caches it; None if it cannot be exported.
 
-        A line to standard error says why it cannot be loaded, exported or cached.
+        Its name, its arguments, and what it closes over besides the settings tell it from others. A
+        line to standard error says why it cannot be loaded, exported or cached.
         """
-        shapes = repr(shapes_of(args)).encode()
-        digest = hashlib.sha256(self._depends + shapes).hexdigest()[:32]
+        differs = repr((shapes_of(args), closed)).encode()
+        digest = hashlib.sha256(self._depends + differs).hexdigest()[:32]
         path, traced = self.path / f"{name}-{digest}.stablehlo", None
         # A run must not end because this one or the next will be slower: a damaged file, a program
         # that calls something which JAX cannot export, a full disk.
@@ -197,9 +201,10 @@ class Program:
     May be called before `compile`, from another thread; the call blocks until it is compiled.
     """
 
-    def __init__(self, compiler: Compiler, stage: str, name: str):
+    def __init__(self, compiler: Compiler, stage: str, name: str, closed: object = ()):
+        """A program without a function yet; for `closed` see `Kept.find_or_trace`."""
         self._compiler, self._monitor = compiler, compiler.monitor
-        self._stage, self._name = stage, name
+        self._stage, self._name, self._closed = stage, name, closed
         self._compiled: Future[Function] = Future()
         self._places: tuple[jax.sharding.NamedSharding, ...] | None = None
 
@@ -253,11 +258,17 @@ class Program:
         share = devices.share(shapes, mesh, whole)
         traced, kept = None, self._compiler.kept
         if kept is not None:
-            traced = kept.find_or_trace(f"{self._stage}-{self._name}", function, share)
+            name = f"{self._stage}-{self._name}"
+            traced = kept.find_or_trace(name, function, share, self._closed)
         if mesh is None:
             return jax.jit(function if traced is None else traced.__call__).lower(*shapes)
         # What devices run is traced apart; see `devices.spread`.
-        spread = devices.spread((traced or trace(function, share)).__call__, mesh, whole)
+        try:
+            traced = traced or trace(function, share)
+        except NotImplementedError as error:
+            reason = f"must be 1: {self._stage} cannot be split ({error})"
+            raise ConfigError("devices", mesh.size, reason) from error
+        spread = devices.spread(traced.__call__, mesh, whole)
         self._places = devices.places(mesh, len(args), whole)
         return jax.jit(spread, in_shardings=self._places).lower(*shapes)
 

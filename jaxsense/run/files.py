@@ -47,13 +47,14 @@ def _naming_errors(path: Path) -> Iterator[None]:
         raise WriteError(error.errno, reason, str(path)) from error
 
 
-def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
+def write(path: Path, content: str | bytes, mode: int = 0o666, *, is_new: bool = False) -> None:
     """Replaces a file atomically: readers never see a part of it, even after a power failure.
 
     Args:
       path: the file.
       content: of the file; text is encoded as UTF-8.
       mode: permissions of the file, before the umask.
+      is_new: whether there must be no such file yet, nor a link.
 
     Raises:
       WriteError: if the file cannot be written; it is then unchanged.
@@ -67,6 +68,8 @@ def write(path: Path, content: str | bytes, mode: int = 0o666) -> None:
                 file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
                 os.fsync(file.fileno())
+            if is_new:
+                path.touch(exist_ok=False)
             partial.replace(path)
             with contextlib.suppress(OSError):  # not all systems let directories be written
                 directory = os.open(path.parent, os.O_RDONLY)

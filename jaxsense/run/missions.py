@@ -140,7 +140,10 @@ class Player:
         )
         begun = key, config, jax.eval_shape(lambda: models or init(key, config))
         options = {"mesh": mesh, "whole": len(begun), "runs_long": long, "wide_vectors": long}
-        self._begin, self._go_on = (Program(compiler, _STAGE, name) for name in ("begin", "go_on"))
+        closed = (*mission.policies,)  # those of a user are not kept
+        self._begin, self._go_on = (
+            Program(compiler, _STAGE, name, closed) for name in ("begin", "go_on")
+        )
         begin = functools.partial(_begin, mission)
         slots = self._begin.compile(begin, *begun, numbers, numbers, faults, **options)
         go_on = functools.partial(_go_on, self._recorded, mission)

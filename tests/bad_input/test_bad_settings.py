@@ -190,7 +190,12 @@ CHANGES = [
     ),
     ({"robots": ("camera", "sonar")}, "must each be one of modalities: camera, lidar"),
     ({"dqn.replay_capacity": 65}, "dqn.replay_capacity = 65: must be a multiple of num_envs = 32"),
-    ({"dqn.replay_capacity": 32 * 10**8}, "must be a whole number, at least 1, within 32 bits"),
+    ({"jmvae.reconstruction_weights": (1e-40, 1.0)}, "0 or of magnitude 1e-30 to 1e+30"),
+    ({"dqn.task": np.ones(2)}, "must be one of map, team"),
+    (
+        {"dqn.replay_capacity": 32 * 10**8},
+        "must be a whole number, at least 1, below 2^31",
+    ),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
 ]
 
@@ -302,7 +307,7 @@ def test_plain_settings_that_are_unknown_are_named(stored, expected):
 def test_settings_of_earlier_runs_load_with_the_values_of_the_constants():
     stored = {
         "mission": {"attempts": 3, "localisation": {"search": {"position": 0.0, "heading": 0.0}}},
-        "filter": {"hidden": [32], "steps": 5},
+        "filter": {"hidden": (32,), "steps": 5},
     }
     config = from_plain(stored, PRESETS["noisy"])
     assert config == dataclasses.replace(

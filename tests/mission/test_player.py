@@ -16,7 +16,7 @@ from jaxsense.mission.state import Record
 from jaxsense.run import devices, ledger, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
-from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.monitor import Monitor, StageError, Stopped
 
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
@@ -213,3 +213,20 @@ def test_values_that_are_not_finite_end_the_missions(play):
 
     with pytest.raises(StageError, match="mission: values of policy naive are not finite"):
         play(step=lost)
+
+
+def test_kept_programs_are_told_apart_by_the_policies_in_them(team, monkeypatch):
+    made = []
+
+    class Program:
+        def __init__(self, compiler, stage, name, closed):
+            made.append(closed)
+
+        def compile(self, *args, **options):
+            raise Stopped
+
+    monkeypatch.setattr(missions, "Program", Program)
+    for names in (["latent"], ["naive"], ["naive", "latent"]):
+        with Compiler(Monitor()) as compiler, pytest.raises(Stopped):
+            missions.Player(team.playing(names), compiler, 1)
+    assert made[::2] == [("latent",), ("naive",), ("latent", "naive")]
