@@ -29,6 +29,11 @@ def without_times(path):
     return summary
 
 
+def contents(path):
+    """Every file and directory below a directory, with what is in it."""
+    return {each: each.read_bytes() if each.is_file() else None for each in path.rglob("*")}
+
+
 def save_models(run, models):
     """Saves models in the directory of a run, as if it had trained them."""
     for name, tree in _named(models, run.settings.config).items():

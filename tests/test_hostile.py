@@ -12,7 +12,7 @@ import sys
 import numpy as np
 import pytest
 from flax import serialization
-from smoke import save_models
+from smoke import contents, save_models
 from summaries import CASE, EVALUATION, RESULTS, SUMMARY
 from untrained import blank
 
@@ -75,14 +75,6 @@ def resume(path):
         run.checkpoints.save("unfinished/dqn_camera", TRAINING)
         run.append_metrics(stage="jmvae", step=2, loss=0.5)
         run.checkpoints.forget_unfinished(["dqn_camera"])
-
-
-def everything(path):
-    """All files and directories there, with their content."""
-    return {
-        each.relative_to(path): each.read_bytes() if each.is_file() else None
-        for each in sorted(path.rglob("*"))
-    }
 
 
 def put(name, make):
@@ -202,14 +194,14 @@ def test_a_directory_that_somebody_has_prepared(name, base, tmp_path):
         (outside / secret).write_text("precious")
     change, expected = CASES[name]
     change(run, outside)
-    before, warned = everything(outside), io.StringIO()
+    before, warned = contents(outside), io.StringIO()
     said = [outcome(jaxsense.load, run), outcome(evaluate._report, run, CONFIG)]
     with contextlib.redirect_stderr(warned):
         said.append(outcome(resume, run))
     said += warned.getvalue().splitlines()
     assert any(expected in line for line in said), said
     assert expected or not any(said), said
-    assert everything(outside) == before
+    assert contents(outside) == before
     assert all(line.isprintable() for line in said)
 
 

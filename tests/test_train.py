@@ -125,17 +125,12 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
 
 
-def help_of(argv, program, capsys, monkeypatch):
-    """The help of a program on a terminal of 80 columns."""
+def test_all_help_explains_every_field(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit) as stop:
-        program.main(argv)
+        train.main(["--help-all"])
     assert stop.value.code == 0
-    return capsys.readouterr().out
-
-
-def test_all_help_explains_every_field(capsys, monkeypatch):
-    text = help_of(["--help-all"], train, capsys, monkeypatch)
+    text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 80
     options = re.findall(r"^  (--\S+)", text, re.MULTILINE)
     assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
-from smoke import save_models
+from smoke import contents, save_models
 from untrained import blank
 
 import jaxsense
@@ -31,11 +31,6 @@ def run(tmp_path_factory):
     with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
         save_models(created, blank(SMOKE))
     return path
-
-
-def contents(path):
-    """Every file below a directory, with what is in it."""
-    return {p: p.read_bytes() if p.is_file() else None for p in path.rglob("*")}
 
 
 @pytest.fixture

@@ -33,8 +33,10 @@ def measure(distance, config):
 
 
 def ranges(distance, **settings):
-    """`[NUMBER, B]` measurements of the same distances."""
-    return np.asarray(measure(np.float32(distance), LidarConfig(**settings)))
+    """`[NUMBER, B]` measurements of the same distances, by one program."""
+    beams = np.full(8, np.inf, np.float32)
+    beams[: len(distance)] = distance
+    return np.asarray(measure(beams, LidarConfig(**settings)))[:, : len(distance)]
 
 
 def test_noise_grows_with_the_distance():

@@ -39,7 +39,8 @@ def some_looks(key, number, is_shown=True):
 def problem():
     shown, labels = some_looks(jax.random.key(1), 1000)
     nothing, _ = some_looks(jax.random.key(2), 500, False)
-    untrained = detectors.init(KEY, shown.windows, 2, CONFIG, measures_distance=True)
+    init = lambda windows: detectors.init(KEY, windows, 2, CONFIG, measures_distance=True)  # noqa: E731
+    untrained = jax.jit(init)(shown.windows)
     return detectors.Fitting(CONFIG, untrained, shown, labels, nothing)
 
 
