@@ -116,7 +116,7 @@ assert state() == before
 def test_a_number_of_devices_that_cannot_be_is_named(monkeypatch, capsys):
     for number in ("0", "-1", str(10**9)):
         line = error_line(["--devices", number], capsys)
-        assert f"devices = {number}: must be from 1 to 256" in line
+        assert f"devices = {number}: must be a whole number, from 1 to 256" in line
     assert devices.start(3) == Workers(threads=3)
     assert devices.start(None).number == min(devices.cores(), 8)
     # The two devices of these tests, as if they were accelerators.

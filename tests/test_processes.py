@@ -164,7 +164,7 @@ def test_the_first_process_checks_its_options_before_others_join(tmp_path, monke
     shared = ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "0"]
     for options, expected in (
         (["--out", str(tmp_path)], "is not empty"),
-        (["--devices", "999"], "devices = 999: must be from 1 to 256"),
+        (["--devices", "999"], "devices = 999: must be a whole number, from 1 to 256"),
         (["--resume", str(tmp_path)], "is not a run directory"),
     ):
         with pytest.raises(SystemExit):

@@ -98,7 +98,7 @@ def test_a_seed_that_fails_leaves_the_others(seeds, cache, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["--num-seeds", "0"], "num_seeds = 0: must be from 1 to 10,000"),
+        (["--num-seeds", "0"], "num_seeds = 0: must be a whole number, from 1 to 10,000"),
         (["--num-seeds", "2", "--seed", str(2**32 - 1)], "num_seeds = 2: leads beyond seed 2^32"),
     ],
 )

@@ -47,7 +47,7 @@ def test_a_program_trains_with_its_own_change(monkeypatch):
     run(PROGRAM, __name__="imported")
     assert given == []
     run(PROGRAM, __name__="__main__")
-    assert [each.config.carried for each in given] == [("camera", "camera", "lidar")]
+    assert [each.settings.config.carried for each in given] == [("camera", "camera", "lidar")]
 
 
 def test_classes_are_those_of_the_example(example):

@@ -72,23 +72,16 @@ def test_summary_keeps_its_contract(smoke_run):
 def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     first = dataclasses.replace(PRESETS["smoke"].mission, policies=("naive_2", "latent"))
     config, drawn = dataclasses.replace(PRESETS["smoke"], mission=first), []
-    draw = lambda *inputs: drawn.append(inputs[-2:]) or ""  # noqa: E731
+    draw = lambda config, missions, *_: drawn.append(missions) or [""] * len(missions)  # noqa: E731
     monkeypatch.setattr(drawing.film, "draw", draw)
-    monkeypatch.setattr(drawing.plots, "policies", lambda missions: Figure())
+    monkeypatch.setattr(drawing.plots, "policies", lambda block: Figure())
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
-
-    def recording(steps):
-        return SimpleNamespace(records=None, end=SimpleNamespace(steps=steps))
-
-    played = SimpleNamespace(recording=recording(50), missions={}, naive=None)
-    found = drawing.of_missions(config, learned, played)  # pyright: ignore
-    assert [*found] == ["policies.svg", "mission.svg"]
-    assert drawn == [("naive_2 policy", pytest.approx(5.0))]
-    # With the film of naive exploration, both last as long as the longer one.
-    played = SimpleNamespace(recording=recording(50), missions={}, naive=recording(80))
-    found = drawing.of_missions(config, learned, played)  # pyright: ignore
-    assert [*found] == ["policies.svg", "mission.svg", "mission-naive.svg"]
-    assert drawn[1:] == [("naive_2 policy", pytest.approx(8.0)), ("naive policy", drawn[1][1])]
+    for naive, films in ((None, ["mission.svg"]), ("other", ["mission.svg", "mission-naive.svg"])):
+        played = SimpleNamespace(recording="own", naive=naive)
+        found = drawing.of_missions(config, learned, played, {})  # pyright: ignore
+        assert [*found] == ["policies.svg", *films]
+    own = {"naive_2 policy": "own"}
+    assert drawn == [own, {**own, "naive policy": "other"}]
 
 
 def test_a_finished_run_is_loaded_with_its_settings(smoke_run):
