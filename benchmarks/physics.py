@@ -306,7 +306,7 @@ def _move_side(scenario: Mission, states: MissionState) -> Side:
 
     def periods(states: MissionState) -> tuple[jax.Array, jax.Array]:
         by_period = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)
-        moved = jax.lax.map(lambda states: move(scenario, states)[0], by_period)
+        moved = jax.lax.map(lambda states: move(scenario, states), by_period)
         poses, velocity = moved.scene.poses, moved.velocity
         return tuple(jnp.swapaxes(x, 0, 1) for x in (poses, velocity))  # pyright: ignore
 

@@ -31,7 +31,7 @@ from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team import Team
 from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps
-from jaxsense.mission.choice import ask, choose, times_to_new_looks
+from jaxsense.mission.decide import ask, choose, times_to_new_looks
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
 from jaxsense.models import Models, make_agent, make_jmvae, make_travel
 from jaxsense.run import cli, devices, files, output, rundir

@@ -59,14 +59,12 @@ def recording(steps: int = 60) -> Recording:
         time=np.minimum(0.1 * (i + 1), 0.1 * steps).astype(np.float32),
         poses=poses,
         command=np.zeros((rows, 2, 2)),
-        wanted=np.zeros((rows, 2, 2)),
         phase=phase,
         target=target,
         scanned=scanned,
         detected=scanned,
         belief=Belief(mean, std),
         seen=seen,
-        clearance=np.ones(rows),
     )
     layout = SimpleNamespace(
         position=np.array([[-1.0, 1.0], [1.0, 0.4], [0.0, -1.0]]),

@@ -24,7 +24,7 @@ def play(name):
 
 def paths():
     layout = sim.random_layout(KEY, CONFIG.arena, jnp.array([0, 1, 2]))
-    return roadmap.lengths(CONFIG, layout, roadmap.build(CONFIG, layout), jnp.zeros(2), 1)
+    return roadmap.build(CONFIG, layout).lengths(jnp.zeros(2), 1)
 
 
 def values():

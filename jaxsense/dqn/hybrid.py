@@ -1,6 +1,6 @@
 """What missions read from a Q-network where hand-written rules choose among the looks that pay.
 
-The rules are those of `mission.choice`; here is which looks pay, and in which order.
+The rules are those of `mission.decide`; here is which looks pay, and in which order.
 """
 
 import dataclasses

@@ -74,13 +74,6 @@ class Policy:
     is_unordered: bool = False
     worth: Values | None = None
 
-    def gains(self, key: Key, models: "Trained", known: Known) -> Float[Array, " N"]:
-        """Numbers above 0 for the looks that pay, see `worth`."""
-        if self.worth is not None:
-            return self.worth(key, models, known)
-        values = self.values(key, models, known)
-        return values[:-1] - values[-1]
-
 
 def as_policy(policy: Values | Policy) -> Policy:
     """A custom policy, of which a function alone has only values."""

@@ -7,14 +7,14 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 from mujoco import mjx
 
 from jaxsense.config.mission import CONTROL_PERIOD, Search
 from jaxsense.core.types import Index, Key, call, others, pytree
-from jaxsense.mission import navigation, roadmap
-from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, is_taken, sees
-from jaxsense.mission.maps import Evidence, Learned
+from jaxsense.mission import navigation
+from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, views
+from jaxsense.mission.maps import Learned
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -25,7 +25,9 @@ from jaxsense.mission.state import (
     RECENT_LOOKS,
     Mission,
     MissionState,
+    Robot,
     Robots,
+    rows_at,
 )
 from jaxsense.models import Models
 from jaxsense.sim import arena as arenas
@@ -41,56 +43,34 @@ _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 _MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
 _NO_KIND = jnp.iinfo(jnp.int32).max
+_WRITTEN = "robots", "belief", "log_posterior", "times_seen", "looked_from", "memory"  # by a scan
 
 Row = TypeVar("Row")
 Result = TypeVar("Result")
 
 
-@pytree
-class Course:
-    """Where a robot wants to move.
-
-    Attributes:
-      waypoint: where its path leads next, in metres.
-      bearing: of its target, see `viewpoints.bearing`.
-    """
-
-    phase: Int[Array, ""]
-    waypoint: Float[Array, "2"]
-    bearing: Float[Array, ""]
-    makes_room: Bool[Array, ""]
-
-
 @jax.named_scope("mission.approach")
-def approach(
-    mission: Mission, models: Models, state: MissionState, robot: Index
-) -> tuple[MissionState, Course]:
+def approach(mission: Mission, models: Models, state: MissionState, robot: Index) -> MissionState:
     """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
 
     A robot need not get to the viewpoint itself if a look from nearby is new.
-
-    Returns:
-      The next state, and where the robot wants to move, see `steer`.
     """
-    config, own = mission.config, state.robot(robot)
-    num_views = state.roadmap.viewpoints.shape[1]
-    poi, view = _target(mission, own), jnp.minimum(own.view, num_views - 1)
-    position, standing = state.believed_poses[robot, :2], state.standing_robots(robot)
-    length, waypoint = roadmap.next_waypoint(
-        config, state.scene.layout, state.roadmap, own.to_view, position, standing, poi, view
-    )
-    to_goal = jnp.linalg.norm(state.roadmap.viewpoints[poi, view] - position)
+    me = Robot(mission, state, robot)
+    own, poi, paths = me.own, me.target, state.roadmap
+    num_views = paths.viewpoints.shape[1]
+    view = jnp.minimum(own.view, num_views - 1)
+    length, waypoint = paths.next_waypoint(own.to_view, me.pose[:2], me.standing, poi, view)
+    viewpoint = paths.viewpoints[poi, view]
+    is_free, sees = views(me, poi, viewpoint[None])
     is_here = own.view == num_views
-    modality = mission.modalities[robot]
-    apart = mission.map_of(state, robot).apart(position[None], poi, modality)[0]
-    to_go = models.novelty.to_go(apart, modality)
-    is_near = to_goal <= jnp.where(to_go > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
-    is_there = is_here | (is_near & sees(mission, state, robot, poi))
+    apart = me.map.apart(me.pose[None, :2], poi, me.modality)[0]
+    reach = jnp.where(models.novelty.to_go(apart, me.modality) > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
+    is_there = is_here | (sees & (jnp.linalg.norm(viewpoint - me.pose[:2]) <= reach))
 
-    time, is_driving = mission.time(state), own.phase == DRIVING
+    time, is_driving = state.time, own.phase == DRIVING
     arrives = is_driving & is_there
     # The viewpoint is occupied or blocked by another robot: not a failure.
-    is_blocked = is_driving & ~is_there & is_taken(mission, state, robot, poi, view)
+    is_blocked = is_driving & ~is_there & ~is_free[0]
     progresses = is_driving & (length < own.path_left - _PROGRESS)
     is_stuck = is_driving & ~is_there & ~is_blocked & ~progresses
     is_stuck &= time - own.progress_at > STUCK_TIME
@@ -100,66 +80,53 @@ def approach(
     phase = jnp.select(
         [arrives, is_blocked, is_stuck, is_back], [FACING, IDLE, BACKING, IDLE], own.phase
     )
-    makes_room = (phase == ENDED) & _is_in_the_way(mission, state, robot)
-    makes_room &= time < state.faults.stops_at[robot]
-    blocked = excluded.at[own.view].set(True)
-    course = Course(phase, waypoint, _bearing(mission, state, robot), makes_room)
-    state = state.with_robot(
+    return state.with_robot(
         robot,
         phase=phase,
+        wanted=_steer(me, phase, waypoint),
         attempts=attempts,
         unreachable=own.unreachable | gives_up,
         goals=own.goals - is_blocked,
         reached=own.reached + (arrives & ~is_here),
-        excluded=jnp.where(is_blocked, blocked, excluded),
+        excluded=excluded | (is_blocked & (jnp.arange(num_views + 1) == own.view)),
         path_left=jnp.where(progresses, length, own.path_left),
         progress_at=jnp.where(progresses | arrives, time, own.progress_at),
         backs_off_until=jnp.where(is_stuck, time + RECOVERY_TIME, own.backs_off_until),
     )
-    return state, course
-
-
-def _target(mission: Mission, own: Robots) -> Int[Array, ""]:
-    """A robot's target; the last PoI if it has none, so that an index is valid."""
-    return jnp.minimum(own.target, mission.config.arena.num_pois - 1)
 
 
 @jax.named_scope("mission.steer")
-def steer(mission: Mission, state: MissionState, robot: Index, course: Course) -> Float[Array, "2"]:
-    """Speeds that a robot wants: along its path, backing off, or turning.
+def _steer(me: Robot, phase: Int[Array, ""], waypoint: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Speeds that a robot wants: along its path, backing off, making room, or turning.
 
     It senses where obstacles are, but has to trust its own pose for where the waypoint is.
     """
-    config, scene, phase = mission.config, state.scene, course.phase
-    aim = localisation.aimed_at(course.waypoint, scene.poses[robot], state.pose_error[robot])
+    state, scene, arena = me.state, me.state.scene, me.mission.config.arena
+    poses, commands = scene.poses, me.state.robots.command
+    makes_room = (phase == ENDED) & _is_in_the_way(me)
+    makes_room &= state.time < state.faults.stops_at[me.index]
+    backs_off = (phase == BACKING) | makes_room
+    aim = localisation.aimed_at(waypoint, poses[me.index], state.pose_error[me.index])
     drive = navigation.drive_to(
-        config.arena,
-        scene.layout,
-        scene.poses,
-        state.robots.command,
-        robot,
-        aim,
-        CONTROL_PERIOD,
-        backs_off=(phase == BACKING) | course.makes_room,
+        arena, scene.layout, poses, commands, me.index, aim, CONTROL_PERIOD, backs_off
     )
-    turn = navigation.face(course.bearing)
-    is_driving = (phase == DRIVING) | (phase == BACKING) | course.makes_room
+    turn = navigation.face(_bearing(me))
+    is_driving = (phase == DRIVING) | backs_off
     return jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
 
 
-def _bearing(mission: Mission, state: MissionState, robot: Index) -> Float[Array, ""]:
+def _bearing(me: Robot) -> Float[Array, ""]:
     """Angle from a robot's heading to its target, as it believes, from -pi to pi radians."""
-    poi = _target(mission, state.robot(robot))
-    return viewpoints.bearing(state.believed_poses[robot], state.scene.layout.position[poi])
+    return viewpoints.bearing(me.pose, me.state.scene.layout.position[me.target])
 
 
-def _is_in_the_way(mission: Mission, state: MissionState, robot: Index) -> Bool[Array, ""]:
+def _is_in_the_way(me: Robot) -> Bool[Array, ""]:
     """Whether another robot nearby drives without progress, or backs off."""
-    robots, poses = state.robots, state.believed_poses
-    waits = mission.time(state) - robots.progress_at > _PATIENCE
+    robots, positions = me.state.robots, me.state.believed_poses[:, :2]
+    waits = me.state.time - robots.progress_at > _PATIENCE
     needs_room = (robots.phase == BACKING) | ((robots.phase == DRIVING) & waits)
-    is_near = jnp.linalg.norm(poses[:, :2] - poses[robot][None, :2], axis=-1) < _NEARBY
-    return jnp.any(others(needs_room & is_near, robot))
+    is_near = jnp.linalg.norm(positions - me.pose[None, :2], axis=-1) < _NEARBY
+    return jnp.any(others(needs_room & is_near, me.index))
 
 
 def _fail(
@@ -167,79 +134,79 @@ def _fail(
 ) -> tuple[Int[Array, ""], Bool[Array, " W"], Bool[Array, " N"]]:
     """New `attempts` and `excluded` of a robot after a failure, and which PoI it gives up."""
     failures = own.attempts + applies
-    excluded = jnp.where(applies, own.excluded.at[own.view].set(True), own.excluded)
+    excluded = own.excluded | (applies & (jnp.arange(len(own.excluded)) == own.view))
     is_target = jnp.arange(own.unreachable.shape[0]) == own.target
     return failures, excluded, applies & (failures >= ATTEMPTS) & is_target
 
 
-@pytree
-class _Aim:
-    """Whether a robot scans, and which PoI, at which believed bearing [rad] and distance [m]."""
-
-    scans: Bool[Array, ""]
-    poi: Int[Array, ""]
-    bearing: Float[Array, ""]
-    distance: Float[Array, ""]
-    noise_key: Key
-    message_key: Key
-
-
 @jax.named_scope("mission.scan")
 def scan(
-    keys: Key,
-    mission: Mission,
-    models: Models,
-    states: MissionState,
-    robot: Index,
+    keys: Key, mission: Mission, models: Models, states: MissionState, robot: Index
 ) -> MissionState:
     """Scans the PoI that a robot faces, and updates the map, in B missions side by side."""
-    aims = jax.vmap(lambda key, state: _aim(key, mission, state, robot))(keys, states)
     of_robot = mission.config.modality_of_robot
     carried = sorted(set(of_robot))
     which = jnp.array([carried.index(modality) for modality in of_robot])[robot]
+    written = lambda states: {name: getattr(states, name) for name in _WRITTEN}  # noqa: E731
 
-    def look(rows: tuple[MissionState, _Aim], _) -> tuple[Bool[Array, " S"], Learned]:
-        states, aims = rows
-        place = lambda scene: arenas.place(mission.world.arena, scene.layout, scene.poses)  # noqa: E731
-        placed = jax.vmap(place)(states.scene)
-        look_with = lambda i: jax.vmap(  # noqa: E731
-            functools.partial(_look, mission, models, robot, carried[i])
-        )(states, aims, placed)
+    def scanned(rows: tuple[Key, MissionState], _) -> dict[str, PyTree]:
+        keys, states = rows
+        keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
+        aims = jax.vmap(lambda *row: _aim(mission, models, robot, *row))(keys[0], states)
+
+        def look(i: int) -> tuple[Bool[Array, " S"], Learned]:
+            alone = functools.partial(_look, mission, models, robot, carried[i])
+            return jax.vmap(alone)(keys[1], states, aims)
+
         # The choice of the sensor outside the batch: inside, all would scan.
-        return call(look_with, which, len(carried))
+        found = call(look, which, len(carried))
+        return written(jax.vmap(lambda *row: _write(mission, robot, *row))(keys[2], states, *found))
 
-    # Rows that are not due; any content will do, since it is not written.
-    belief, log_posterior = jax.tree.map(lambda x: x[:, 0], (states.belief, states.log_posterior))
-    evidence = None if states.memory is None else Evidence(log_posterior, log_posterior)
-    nothing = jnp.zeros(len(keys), bool), Learned(belief, log_posterior, evidence)
-    looks = where_due(aims.scans & ~states.done, look, nothing, (states, aims))
-    return jax.vmap(functools.partial(_write, mission, robot))(states, aims, *looks)
+    scans = jax.vmap(lambda state: _scans(Robot(mission, state, robot)))(states)
+    after = where_due(scans & ~states.done, scanned, written(states), (keys, states))
+    return dataclasses.replace(states, **after)
+
+
+@jax.named_scope("mission.scans")
+def _scans(me: Robot) -> Bool[Array, ""]:
+    """Whether a robot faces its target and scans it."""
+    state, own, arena = me.state, me.own, me.mission.config.arena
+    is_aligned = jnp.abs(_bearing(me)) <= jnp.radians(GOAL_ANGLE)
+    is_calm = jnp.abs(own.command[1]) <= _TURNS_SLOWLY
+    # It waits for a robot that drives through the view, but not for long.
+    beside = others(state.believed_poses[:, :2], me.index)
+    x, y = me.pose[:1], me.pose[1:2]
+    room = viewpoints.free_room(x, y, 0.0, arena, state.scene.layout, beside, me.target)
+    waits = state.time - own.progress_at > STUCK_TIME
+    return (own.phase == FACING) & is_aligned & is_calm & ((room[0] > 0) | waits)
+
+
+@pytree
+class _Aim:
+    """The arena, at which bearing [rad] and distance [m] a robot believes its target, and novelty.
+
+    Attributes:
+      weight: share of the look that is new evidence.
+    """
+
+    placed: mjx.Data
+    bearing: Float[Array, ""]
+    distance: Float[Array, ""]
+    weight: Float[Array, ""]
 
 
 @jax.named_scope("mission.aim")
-def _aim(key: Key, mission: Mission, state: MissionState, robot: Index) -> _Aim:
-    """Decides whether a robot scans, and what."""
-    config, scene, own = mission.config, state.scene, state.robot(robot)
-    error_key, noise_key, message_key = jax.random.split(key, 3)
-    poi, bearing = _target(mission, own), _bearing(mission, state, robot)
-    is_aligned = jnp.abs(bearing) <= jnp.radians(GOAL_ANGLE)
-    is_calm = jnp.abs(own.command[1]) <= _TURNS_SLOWLY
-    # It waits for a robot that drives through the view, but not for long.
-    positions = state.believed_poses[:, :2]
-    position, beside = positions[robot], others(positions, robot)
-    room = viewpoints.free_room(
-        position[:1], position[1:], 0.0, config.arena, scene.layout, beside, poi
-    )
-    waits = mission.time(state) - own.progress_at
-    is_ready = is_aligned & is_calm & ((room[0] > 0) | (waits > STUCK_TIME))
-    error = jnp.radians(config.viewpoint.bearing_error)
+def _aim(mission: Mission, models: Models, robot: Index, key: Key, state: MissionState) -> _Aim:
+    """How a robot looks, with any sensor."""
+    me, scene = Robot(mission, state, robot), state.scene
+    error = jnp.radians(mission.config.viewpoint.bearing_error)
+    error = jax.random.uniform(key, (), minval=-error, maxval=error)
+    apart = me.map.apart(me.pose[None, :2], me.target, me.modality)[0]
     return _Aim(
-        scans=(own.phase == FACING) & is_ready,
-        poi=poi,
-        bearing=bearing + jax.random.uniform(error_key, (), minval=-error, maxval=error),
-        distance=jnp.linalg.norm(scene.layout.position[poi] - position),
-        noise_key=noise_key,
-        message_key=message_key,
+        placed=arenas.place(mission.world.arena, scene.layout, scene.poses),
+        bearing=_bearing(me) + error,
+        distance=jnp.linalg.norm(scene.layout.position[me.target] - me.pose[:2]),
+        weight=models.novelty.weight(apart, me.modality),
     )
 
 
@@ -249,26 +216,23 @@ def _look(
     models: Models,
     robot: Index,
     modality: int,
+    key: Key,
     state: MissionState,
     aim: _Aim,
-    placed: mjx.Data,
 ) -> tuple[Bool[Array, ""], Learned]:
     """Whether a scan detects its PoI with enough confidence, and what it would change."""
-    world, scene, sensor = mission.world, state.scene, mission.world.sensors[modality]
-    search = Search(*mission.config.mission.localisation.search)
-    wide = tuple(windows.widened(each, search) for each in world.sensors)
-    world = dataclasses.replace(world, sensors=wide)
-    time, bearing = mission.time(state), aim.bearing
+    config, sensor, bearing = mission.config, mission.world.sensors[modality], aim.bearing
+    search = Search(*config.mission.localisation.search)
+    wide = tuple(windows.widened(each, search) for each in mission.world.sensors)
+    world = dataclasses.replace(mission.world, sensors=wide)
     readings = worlds.scan_around(
-        aim.noise_key, world, scene, placed, robot, bearing, modality, time
+        key, world, state.scene, aim.placed, robot, bearing, modality, state.time
     )
-    readings = jnp.where(time >= state.faults.blind_at[robot], sensor.blind, readings)
-    found = models.detect_in_window(modality, sensor, readings, aim.bearing, aim.distance, search)
-    is_confident = jnp.max(found.features) >= mission.config.mission.least_confidence
-    known = mission.map_of(state, robot)
-    apart = known.apart(state.believed_poses[robot, :2][None], aim.poi, modality)[0]
-    weight = models.novelty.weight(apart, modality)
-    learned = known.learn(models, aim.poi, found.features, modality, weight)
+    readings = jnp.where(state.time >= state.faults.blind_at[robot], sensor.blind, readings)
+    found = models.detect_in_window(modality, sensor, readings, bearing, aim.distance, search)
+    is_confident = jnp.max(found.features) >= config.mission.least_confidence
+    me = Robot(mission, state, robot)
+    learned = me.map.learn(models, me.target, found.features, modality, aim.weight)
     return found.is_there & is_confident, learned
 
 
@@ -276,48 +240,45 @@ def _look(
 def _write(
     mission: Mission,
     robot: Index,
+    message_key: Key,
     state: MissionState,
-    aim: _Aim,
     detects: Bool[Array, ""],
     learned: Learned,
 ) -> MissionState:
     """Records a scan; if it detects the PoI, updates the map and tells the other robots."""
-    poi, detects = aim.poi, aim.scans & detects
-    modality = mission.modalities[robot]
-    own = state.robot(robot)
-    attempts, excluded, gives_up = _fail(own, aim.scans & ~detects)
-    state = state.with_robot(
-        robot,
-        attempts=attempts,
-        excluded=excluded,
-        undetected=own.undetected | gives_up,
-        phase=jnp.where(aim.scans, IDLE, own.phase),
-        # After a detection the same PoI is a new target.
-        target=jnp.where(detects, mission.config.arena.num_pois, own.target),
-        looks=own.looks + aim.scans,
-        detections=own.detections + detects,
-    )
+    me = Robot(mission, state, robot)
+    own, poi, modality = me.own, me.target, me.modality
+    attempts, excluded, gives_up = _fail(own, ~detects)
     belief, log_posterior = jax.tree.map(
         lambda rows, new: rows.at[poi].set(jnp.where(detects, new, rows[poi])),
         (state.belief, state.log_posterior),
         (learned.belief, learned.log_posterior),
     )
     number = state.times_seen[poi, modality] % RECENT_LOOKS
-    position, memory = state.believed_poses[robot, :2], state.memory
+    position, memory = me.pose[:2], state.memory
     place = jnp.where(detects, position, state.looked_from[poi, modality, number])
     if memory is not None and learned.evidence is not None:
-        time, settings = mission.time(state), mission.config.mission.communication
-        memory = memory.with_look(robot, poi, position, learned.evidence, time, detects)
+        memory = memory.with_look(robot, poi, position, learned.evidence, state.time, detects)
         sends = detects & (jnp.arange(len(memory.number)) == robot)
-        memory = memory.after_messages(aim.message_key, settings, time, sends)
+        settings = mission.config.mission.communication
+        memory = memory.after_messages(message_key, settings, state.time, sends)
     return dataclasses.replace(
         state,
         looked_from=state.looked_from.at[poi, modality, number].set(place),
         belief=belief,
         log_posterior=log_posterior,
         times_seen=state.times_seen.at[poi, modality].add(detects),
-        version=state.version + detects,
         memory=memory,
+    ).with_robot(
+        robot,
+        attempts=attempts,
+        excluded=excluded,
+        undetected=own.undetected | gives_up,
+        phase=jnp.int32(IDLE),
+        # After a detection the same PoI is a new target.
+        target=jnp.where(detects, mission.config.arena.num_pois, own.target),
+        looks=own.looks + 1,
+        detections=own.detections + detects,
     )
 
 
@@ -327,7 +288,7 @@ def where_due(
     function: Callable[[Row, Int[Array, ""]], Result],
     before: Result,
     inputs: Row,
-    kinds: Int[Array, " B"] | None = None,
+    kinds: Int[Array, " B"] | int = 0,
 ) -> Result:
     """Applies a function to the rows of a batch that are due, one group of rows after another.
 
@@ -335,24 +296,21 @@ def where_due(
     inside a `vmap` would take all branches. Under a `vmap`, so does this function.
 
     Args:
-      kinds: `[B]` int32, one kind by default.
+      kinds: `[B]` int32; one kind by default.
     """
-    of_row = jnp.zeros(len(due), jnp.int32) if kinds is None else kinds
+    due_kinds = jnp.where(due, kinds, _NO_KIND)
     total, number = len(due), jnp.sum(due)
     size = min(total, max(_MIN_ROWS, total // 16))
-    order = jnp.argsort(jnp.where(due, of_row, _NO_KIND))
-
-    def rows_of(x: Shaped[Array, "B ..."], row: Int[Array, " S"]) -> Shaped[Array, "S ..."]:
-        return x.at[row].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    order = jnp.argsort(due_kinds)
 
     def advance(carry: tuple[jax.Array, Result]) -> tuple[jax.Array, Result]:
         first, after = carry
         index = first + jnp.arange(size)
-        row = rows_of(order, jnp.minimum(index, total - 1))
-        kind_of = jnp.where(index < number, rows_of(of_row, row), _NO_KIND)
+        row = rows_at(order, jnp.minimum(index, total - 1))
+        kind_of = jnp.where(index < number, rows_at(due_kinds, row), _NO_KIND)
         kind = kind_of[0]
         is_new = kind_of == kind
-        new = function(jax.tree.map(lambda x: rows_of(x, row), inputs), kind)
+        new = function(jax.tree.map(lambda x: rows_at(x, row), inputs), kind)
         kept = jnp.where(is_new, row, total)  # drops the others
 
         def put(x: Shaped[Array, "B ..."], new: Shaped[Array, "S ..."]) -> Shaped[Array, "B ..."]:

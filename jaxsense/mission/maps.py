@@ -180,21 +180,24 @@ class Learned:
 
 
 @pytree
-class SharedMap:
+class SharedMap(Contents):
     """The map of all looks, which every robot knows without delay.
 
     Attributes:
       looked_from: places of recent looks, see `MissionState`.
     """
 
-    contents: Contents
     looked_from: Float[Array, "N M K 2"]
-    version: Int[Array, ""]
+
+    @property
+    def version(self) -> Int[Array, ""]:
+        """Number of looks, `[]` int32."""
+        return jnp.sum(self.times_seen)
 
     def read(self, models: Models) -> Contents:
         """What the map says."""
         del models
-        return self.contents
+        return self
 
     def apart(
         self, positions: Float[Array, "P 2"], poi: Int[Array, ""], modality: Index
@@ -216,11 +219,10 @@ class SharedMap:
         Args:
           weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
         """
-        old: Contents = jax.tree.map(lambda x: x[poi], self.contents)
-        seen = old.times_seen > 0
+        belief, seen = jax.tree.map(lambda x: x[poi], (self.belief, self.times_seen > 0))
         return Learned(
-            belief=models.fusion.update(old.belief, seen, features, modality, weight),
-            log_posterior=models.bayes.update(old.log_posterior, features, modality, weight),
+            belief=models.fusion.update(belief, seen, features, modality, weight),
+            log_posterior=models.bayes.update(self.log_posterior[poi], features, modality, weight),
             evidence=None,
         )
 

@@ -63,22 +63,14 @@ def face(bearing: Float[Array, ""]) -> Float[Array, "2"]:
     return jnp.stack([jnp.zeros_like(bearing), jnp.clip(4.0 * bearing, -1.0, 1.0)])
 
 
-def clearance(arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]) -> Float[Array, " R"]:
+def clearance(
+    arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]
+) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
     """Free distance around each robot, exact for the actual shapes of the PoIs.
 
     Returns:
-      `[R]` metres from a robot's outline to the nearest wall, PoI or robot; negative inside one.
-    """
-    return jnp.minimum(*clearances(arena, layout, poses))
-
-
-def clearances(
-    arena: ArenaConfig, layout: Layout, poses: Float[Array, "R 3"]
-) -> tuple[Float[Array, " R"], Float[Array, " R"]]:
-    """Free distance around each robot as in `clearance`, to what stands and to other robots.
-
-    Returns:
-      `[R]` metres to the nearest wall or PoI, and `[R]` to the nearest robot.
+      `[R]` metres from a robot's outline to the nearest wall or PoI, and `[R]` to the nearest
+      robot; negative inside one.
     """
     chex.assert_shape(poses, (None, 3))
     x, y = poses[:, :1], poses[:, 1:2]
@@ -103,7 +95,10 @@ def clearances(
 
 
 class _Arcs(NamedTuple):
-    """Arcs of `[S, 2]` commands at `[T]` times [s]: `[S, T]` x [m], y [m], and heading."""
+    """Arcs of `[S, 2]` commands of a robot at `[T]` times [s], in its own frame.
+
+    `[S, T]` x [m], y [m], cosine and sine of the heading.
+    """
 
     commands: jax.Array
     times: jax.Array
@@ -111,24 +106,6 @@ class _Arcs(NamedTuple):
     y: jax.Array
     cos: jax.Array
     sin: jax.Array
-
-
-class _Frame(NamedTuple):
-    """A robot's frame, in which its arcs are constants: `[3]` pose, cosine and sine of yaw."""
-
-    pose: jax.Array
-    cos: jax.Array
-    sin: jax.Array
-
-    def of(self, positions: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Coordinates x and y in the frame of `[..., 2]` positions in the world."""
-        to_x, to_y = positions[..., 0] - self.pose[0], positions[..., 1] - self.pose[1]
-        return self.cos * to_x + self.sin * to_y, self.cos * to_y - self.sin * to_x
-
-    def in_world(self, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Coordinates in the world of positions in the frame."""
-        pose, cos, sin = self
-        return pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y
 
 
 @jax.named_scope("mission.drive_to")
@@ -157,50 +134,40 @@ def drive_to(
     """
     chex.assert_shape([waypoint, poses, commands], [(2,), (None, 3), (len(poses), 2)])
     pose, present = poses[robot], commands[robot]
-    arcs = _arcs(present[1], seconds)
-    frame = _Frame(pose, jnp.cos(pose[2]), jnp.sin(pose[2]))
-    map_room, map_room_now = _room_of_map(arena, layout, frame, arcs)
-    room, room_now = _room_beside(frame, arcs, others(poses, robot), others(commands, robot))
-    room, room_now = jnp.minimum(map_room, room), jnp.minimum(map_room_now, room_now)
-    beside = sidestep(arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
-    arrival = _arrival(arcs, frame, beside, map_room)
+    arcs, cos, sin = _arcs(present[1], seconds), jnp.cos(pose[2]), jnp.sin(pose[2])
+
+    def in_frame(positions: Float[Array, "*K 2"]) -> tuple[jax.Array, jax.Array]:
+        """Coordinates x and y in the robot's frame, in which arcs are constants."""
+        to_x, to_y = positions[..., 0] - pose[0], positions[..., 1] - pose[1]
+        return cos * to_x + sin * to_y, cos * to_y - sin * to_x
+
+    # Room to walls and PoIs, from the arcs and from where the robot is.
+    x, y = pose[0] + cos * arcs.x - sin * arcs.y, pose[1] + sin * arcs.x + cos * arcs.y
+    to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - PLANNING_RADIUS
+    to_wall_now = arena.side / 2 - jnp.max(jnp.abs(pose[:2])) - PLANNING_RADIUS
+    keep, (poi_x, poi_y) = arena.poi_extent + PLANNING_RADIUS, in_frame(layout.position)
+    map_room = jnp.minimum(to_wall, _to_nearest(arcs, poi_x[:, None], poi_y[:, None]) - keep)
+    map_room_now = jnp.minimum(to_wall_now, jnp.min(jnp.hypot(poi_x, poi_y)) - keep)
+    # To other robots, of which each counts twice: it may go straight on or stand.
+    beside, speed = jnp.tile(others(poses, robot), (2, 1)), others(commands, robot)[:, :1]
+    driven = arcs.times[None] * jnp.append(speed, jnp.zeros_like(speed), axis=0)
+    course, (at_x, at_y) = (beside[:, 2] - pose[2])[:, None], in_frame(beside[:, :2])
+    x, y = at_x[:, None] + driven * jnp.cos(course), at_y[:, None] + driven * jnp.sin(course)
+    room = jnp.minimum(map_room, _to_nearest(arcs, x, y) - 2 * PLANNING_RADIUS)
+    beside_now = jnp.min(jnp.hypot(at_x, at_y), initial=jnp.inf) - 2 * PLANNING_RADIUS
+    room_now = jnp.minimum(map_room_now, beside_now)
     is_safe = jax.lax.cummin(room, axis=1) >= jnp.minimum(room_now - 1e-4, -_GRAZE)
+
+    goal = sidestep(arena, layout, pose[:2], waypoint, others(poses[:, :2], robot))
+    arrival = _arrival(arcs, *in_frame(goal), map_room)
     value = jnp.min(jnp.where(is_safe, arrival, jnp.inf)[:, _MAY_LEAVE:], axis=1)
     value = jnp.where(backs_off, -room[:, _MAY_LEAVE], value)
-    return _best(arcs, present, seconds, value, may_start=is_safe[:, 0])
-
-
-def _room_of_map(
-    arena: ArenaConfig, layout: Layout, frame: _Frame, arcs: _Arcs
-) -> tuple[jax.Array, jax.Array]:
-    """Metres to walls and PoIs, `[S, T]` from the arcs and `[]` from the robot now."""
-    x, y, reach = arcs.x, arcs.y, PLANNING_RADIUS
-    world_x, world_y = frame.in_world(x, y)
-    room = arena.side / 2 - jnp.maximum(jnp.abs(world_x), jnp.abs(world_y)) - reach
-    room_now = arena.side / 2 - jnp.max(jnp.abs(frame.pose[:2])) - reach
-    at_x, at_y = frame.of(layout.position)
-    keep = arena.poi_extent + reach
-    room = jnp.minimum(room, _to_nearest(arcs, at_x[:, None], at_y[:, None]) - keep)
-    return room, jnp.minimum(room_now, jnp.min(jnp.hypot(at_x, at_y)) - keep)
-
-
-def _room_beside(
-    frame: _Frame,
-    arcs: _Arcs,
-    poses: Float[Array, "K 3"],
-    commands: Float[Array, "K 2"],
-) -> tuple[jax.Array, jax.Array]:
-    """Metres to other robots, `[S, T]` from the arcs and `[]` from the robot now."""
-    # Each counts twice: it may go straight on or stand.
-    speed = jnp.append(commands[:, 0], jnp.zeros(len(commands)))
-    poses = jnp.tile(poses, (2, 1))
-    at_x, at_y = frame.of(poses[:, :2])
-    course, driven = poses[:, 2] - frame.pose[2], arcs.times[None] * speed[:, None]
-    x = at_x[:, None] + driven * jnp.cos(course)[:, None]
-    y = at_y[:, None] + driven * jnp.sin(course)[:, None]
-    keep = 2 * PLANNING_RADIUS
-    room_now = jnp.min(jnp.hypot(at_x, at_y), initial=jnp.inf) - keep
-    return _to_nearest(arcs, x, y) - keep, room_now
+    # Within reach of the present command; 0 if no arc may start.
+    change = [_change(a, seconds) for a in (amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION)]
+    in_window = jnp.abs(arcs.commands - present[None]) <= jnp.array(change)[None]
+    value = jnp.where(jnp.all(in_window, axis=-1) & is_safe[:, 0], value, jnp.inf)
+    best = jnp.argmin(value)
+    return jnp.where(jnp.isfinite(value[best]), arcs.commands[best], 0.0)
 
 
 def _to_nearest(arcs: _Arcs, x: jax.Array, y: jax.Array) -> jax.Array:
@@ -216,14 +183,10 @@ def _to_nearest(arcs: _Arcs, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _arrival(
-    arcs: _Arcs,
-    frame: _Frame,
-    goal: Float[Array, "2"],
-    room: Float[Array, "S T"],
+    arcs: _Arcs, x: Float[Array, ""], y: Float[Array, ""], room: Float[Array, "S T"]
 ) -> Float[Array, "S T"]:
-    """Seconds to a goal for a robot that leaves the arc at each sample."""
-    goal_x, goal_y = frame.of(goal)
-    to_x, to_y = goal_x - arcs.x, goal_y - arcs.y
+    """Seconds to a goal in the robot's frame for a robot that leaves the arc at each sample."""
+    to_x, to_y = x - arcs.x, y - arcs.y
     distance = jnp.hypot(to_x, to_y)
     ahead, beside = arcs.cos * to_x + arcs.sin * to_y, arcs.cos * to_y - arcs.sin * to_x
     turn = jnp.arctan2(jnp.abs(beside), ahead)
@@ -231,23 +194,6 @@ def _arrival(
     turn *= jnp.clip(distance / 0.08 - 0.25, 0.0, 1.0)
     cost = _INFLATION_COST * jnp.clip(1.0 - jax.lax.cummin(room, axis=1) / _INFLATION, 0.0, 1.0)
     return arcs.times[None] + turn / amiro.MAX_TURN_RATE + distance / amiro.MAX_SPEED + cost
-
-
-def _best(
-    arcs: _Arcs,
-    present: Float[Array, "2"],
-    seconds: float,
-    value: Float[Array, " S"],
-    may_start: Bool[Array, " S"],
-) -> Float[Array, "2"]:
-    """Command of minimum value within reach of the present one; 0 if no arc `may_start`."""
-    change = jnp.array(
-        [_change(a, seconds) for a in (amiro.MAX_ACCELERATION, amiro.MAX_TURN_ACCELERATION)]
-    )
-    in_window = jnp.all(jnp.abs(arcs.commands - present[None]) <= change[None], axis=-1)
-    value = jnp.where(in_window & may_start, value, jnp.inf)
-    best = jnp.argmin(value)
-    return jnp.where(jnp.isfinite(value[best]), arcs.commands[best], 0.0)
 
 
 @jax.named_scope("mission.sidestep")

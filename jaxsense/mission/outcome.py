@@ -82,14 +82,13 @@ def cases(config: Config, policies: Iterable[str] = POLICIES) -> dict[str, Case]
     `ROBOT_stops` and `ROBOT_blind` the robot stops or its sensor goes blind after 6 s. Robots are
     named as in `Config.robot_names`. Cases with faults use the latent policy.
     """
-    healthy, names = no_faults(config), tuple(policies)
+    healthy, names, number = no_faults(config), tuple(policies), len(config.carried)
     _require_names(names)
     found = {name: Case(name, healthy) for name in names}
-    for r, name in enumerate(config.robot_names if len(config.carried) > 1 else ()):
-        own = jnp.arange(len(config.carried)) == r
-        alone = Faults(jnp.where(own, jnp.inf, 0.0), healthy.blind_at)
-        failing = jnp.where(own, FAULT_TIME, jnp.inf)
-        found[f"{name}_alone"] = Case("latent", alone)
+    for r, name in enumerate(config.robot_names if number > 1 else ()):
+        own = jnp.arange(number) == r
+        alone, failing = jnp.where(own, jnp.inf, 0.0), jnp.where(own, FAULT_TIME, jnp.inf)
+        found[f"{name}_alone"] = Case("latent", Faults(alone, healthy.blind_at))
         found[f"{name}_stops"] = Case("latent", Faults(failing, healthy.blind_at))
         found[f"{name}_blind"] = Case("latent", Faults(healthy.stops_at, failing))
     return found
@@ -100,19 +99,18 @@ def reason(state: MissionState) -> Int[Array, ""]:
     """Returns why a mission ended, as an index into `REASONS`."""
     robots = state.robots
     working = robots.phase != FAILED
-    ends = [
-        (~state.done, "running"),
-        (~jnp.any(working), "no robot left"),
-        (jnp.any(working & (robots.phase != ENDED)), "time limit"),
-        (jnp.any(robots.unreachable), "unreachable"),
-        (jnp.any(robots.undetected), "undetected"),
-        (jnp.any(robots.exhausted), "exhausted"),
-        (jnp.any(~working), "robot failed"),
-    ]
-    code = jnp.int32(REASONS.index("finished"))
-    for applies, name in reversed(ends):
-        code = jnp.where(applies, REASONS.index(name), code)
-    return code
+    applies = {
+        "running": ~state.done,
+        "no robot left": ~jnp.any(working),
+        "time limit": jnp.any(working & (robots.phase != ENDED)),
+        "unreachable": jnp.any(robots.unreachable),
+        "undetected": jnp.any(robots.undetected),
+        "exhausted": jnp.any(robots.exhausted),
+        "robot failed": jnp.any(~working),
+        "finished": jnp.bool_(True),
+    }
+    codes = jnp.array([REASONS.index(name) for name in applies])
+    return codes[jnp.argmax(jnp.stack([*applies.values()]))]
 
 
 @checks.typed

@@ -39,18 +39,44 @@ class Roadmap:
         to itself, infinite if there is none or a robot cannot stand at one of them.
       is_next: whether a path may lead straight from each node to each viewpoint; never to one
         that is not free.
-      leads: whether a path leads from each node to any viewpoint of each PoI.
       is_free: viewpoints with room for a robot and a view of the PoI.
+      centres: of the PoIs, in metres.
+      radius: minimum distance of a path's first part from the centres, in metres.
     """
 
     nodes: Float[Array, "K 2"]
     viewpoints: Float[Array, "N V 2"]
     between: Float[Array, "K K"]
     is_next: Bool[Array, "N V K"]
-    leads: Bool[Array, "N K"]
     is_free: Bool[Array, "N V"]
+    centres: Float[Array, "N 2"]
+    radius: Float[Array, ""]
 
-    def last(self, poi: Index, view: Index | slice) -> Float[Array, "... K"]:
+    def lengths(
+        self, position: Float[Array, "2"], poi: Index | slice = slice(None)
+    ) -> Float[Array, "... V"]:
+        """Lengths of the shortest paths to the viewpoints of one PoI, or of all.
+
+        Ignores other robots: they will be elsewhere, or make room.
+
+        Args:
+          position: `[2]` of a robot, in metres; if it is closer to a PoI than planning allows,
+            paths lead away from the PoI.
+
+        Returns:
+          `[..., V]` metres; infinite where no path exists.
+        """
+        chex.assert_shape(position, (2,))
+        is_free = self.is_free[poi]
+        direct, to_node = self._first(position, self.viewpoints[poi].reshape(-1, 2))
+        to_last, last = jnp.min(to_node[:, None] + self.between, axis=0), self.last(poi)
+        around = jnp.min(jnp.broadcast_to(to_last, last.shape) + last, axis=-1)
+        found = jnp.minimum(jnp.where(is_free, direct.reshape(is_free.shape), jnp.inf), around)
+        return jnp.where(jnp.isposinf(found), jnp.inf, found)  # infinite without a gradient
+
+    def last(
+        self, poi: Index | slice = slice(None), view: Index | slice = slice(None)
+    ) -> Float[Array, "... K"]:
         """Lengths of straight lines from the nodes to viewpoints, the last parts of paths.
 
         Returns:
@@ -69,124 +95,68 @@ class Roadmap:
         """
         return jnp.min(self.between + self.last(poi, view)[None], axis=1)
 
+    @jax.named_scope("mission.next_waypoint")
+    def next_waypoint(
+        self,
+        to_view: Float[Array, " K"],
+        position: Float[Array, "2"],
+        others: Float[Array, "S 2"],
+        poi: Index,
+        view: Index,
+    ) -> tuple[Float[Array, ""], Float[Array, "2"]]:
+        """Finds length and first waypoint of the shortest path to one viewpoint.
+
+        Args:
+          to_view: see `to_viewpoint`.
+          position: `[2]` of a robot in metres, see `lengths`.
+          others: `[S, 2]` positions of standing robots, in metres, which cannot be waypoints.
+
+        Returns:
+          `[]` length in metres, infinite if no path exists, and `[2]` the waypoint, to which the
+          straight line is free.
+        """
+        goal = self.viewpoints[poi, view][None]
+        first = jnp.concatenate(self._first(position, goal))
+        ends = jnp.concatenate([goal, self.nodes])
+        apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
+        is_taken = jnp.any(apart < 2 * PLANNING_RADIUS, axis=-1)
+        # Of two nodes on one path the farther one, or a robot that has reached a node would stay.
+        remaining = jnp.append(0.0, 1.001 * to_view)
+        total = first + jnp.where(self.is_free[poi, view], remaining, jnp.inf)
+        total = jnp.where(is_taken, jnp.inf, total)
+        best = jnp.argmin(total)
+        return total[best], ends[best]
+
+    def _first(
+        self, position: Float[Array, "2"], goals: Float[Array, "G 2"]
+    ) -> tuple[Float[Array, " G"], Float[Array, " K"]]:
+        """Lengths of free straight lines from a position to goals and to all nodes."""
+        ends = jnp.concatenate([goals, self.nodes])
+        length = _straight(position[None], ends, self.centres, self.radius)[0]
+        return length[: len(goals)], length[len(goals) :]
+
 
 @checks.typed
 def build(config: Config, layout: Layout) -> Roadmap:
     """Computes the viewpoints of a layout and the paths to them."""
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
-    arena = config.arena
-    radius = _radius(config)
+    arena, centres = config.arena, layout.position
+    radius = arena.poi_extent + PLANNING_RADIUS + _MARGIN
     sides = 2 * jnp.pi * jnp.arange(float(NODES_PER_POI)) / NODES_PER_POI
     # So far out that the paths between neighbours do not cut the circle.
     ring = (radius + _LEEWAY) / math.cos(math.pi / NODES_PER_POI)
     around = ring * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
-    nodes = (layout.position[:, None] + around[None]).reshape(-1, 2)
+    nodes = (centres[:, None] + around[None]).reshape(-1, 2)
     reach = arena.side / 2 - PLANNING_RADIUS
-    to_pois = jnp.linalg.norm(nodes[:, None] - layout.position[None], axis=-1)
+    to_pois = jnp.linalg.norm(nodes[:, None] - centres[None], axis=-1)
     is_usable = jnp.all(to_pois >= radius, axis=-1) & (jnp.max(jnp.abs(nodes), axis=-1) <= reach)
     goals, is_free = _viewpoints(config, layout)
-    edges = _straight(nodes, nodes, layout.position, radius)
+    edges = _straight(nodes, nodes, centres, radius)
     between = _shortest(jnp.where(is_usable[:, None] & is_usable[None], edges, jnp.inf))
-    is_next = _is_clear(goals.reshape(-1, 2), nodes, layout.position, radius) & is_usable[None]
+    is_next = _is_clear(goals.reshape(-1, 2), nodes, centres, radius) & is_usable[None]
     is_next = is_next.reshape(*is_free.shape, -1) & is_free[..., None]
-    ends = jnp.any(is_next, axis=1)
-    # Numbers of ways, which a product of matrices counts faster than anything else.
-    ways = jnp.dot(ends.astype(jnp.float32), jnp.isfinite(between).T.astype(jnp.float32))
-    return Roadmap(nodes, goals, between, is_next, ways > 0, is_free)
-
-
-def lengths(
-    config: Config, layout: Layout, roadmap: Roadmap, position: Float[Array, "2"], poi: Index
-) -> Float[Array, " V"]:
-    """Computes the lengths of the shortest paths to the viewpoints of a PoI.
-
-    Ignores other robots: they will be elsewhere, or make room.
-
-    Args:
-      position: `[2]` of a robot, in metres; if it is closer to a PoI than planning allows, paths
-        lead away from the PoI.
-
-    Returns:
-      `[V]` metres; infinite where no path exists.
-    """
-    chex.assert_shape(position, (2,))
-    goals = roadmap.viewpoints[poi]
-    direct, to_node = _first(config, layout, roadmap, position, goals)
-    to_last = jnp.min(to_node[:, None] + roadmap.between, axis=0)
-    around = jnp.min(to_last[None] + roadmap.last(poi, slice(None)), axis=-1)
-    found = jnp.minimum(jnp.where(roadmap.is_free[poi], direct, jnp.inf), around)
-    return jnp.where(jnp.isposinf(found), jnp.inf, found)  # infinite without a gradient
-
-
-@jax.named_scope("mission.reachable")
-def reachable(
-    config: Config, layout: Layout, roadmap: Roadmap, position: Float[Array, "2"]
-) -> Bool[Array, " N"]:
-    """Marks the PoIs that have a reachable viewpoint, see `lengths`.
-
-    Args:
-      position: `[2]` of a robot, in metres.
-    """
-    chex.assert_shape(position, (2,))
-    goals = roadmap.viewpoints.reshape(-1, 2)
-    ends = jnp.concatenate([goals, roadmap.nodes])
-    is_clear = _is_clear(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
-    to_goal, to_node = jnp.split(is_clear, [len(goals)])
-    direct = to_goal.reshape(roadmap.is_free.shape) & roadmap.is_free
-    around = to_node[None] & roadmap.leads
-    return jnp.any(direct, axis=-1) | jnp.any(around, axis=-1)
-
-
-@jax.named_scope("mission.next_waypoint")
-def next_waypoint(
-    config: Config,
-    layout: Layout,
-    roadmap: Roadmap,
-    to_view: Float[Array, " K"],
-    position: Float[Array, "2"],
-    others: Float[Array, "S 2"],
-    poi: Index,
-    view: Index,
-) -> tuple[Float[Array, ""], Float[Array, "2"]]:
-    """Finds length and first waypoint of the shortest path to one viewpoint.
-
-    Args:
-      position: `[2]` of a robot in metres, see `lengths`.
-      others: `[S, 2]` positions of standing robots, in metres, which cannot be waypoints.
-
-    Returns:
-      `[]` length in metres, infinite if no path exists, and `[2]` the waypoint, to which the
-      straight line is free.
-    """
-    goal = roadmap.viewpoints[poi, view][None]
-    first = jnp.concatenate(_first(config, layout, roadmap, position, goal))
-    ends = jnp.concatenate([goal, roadmap.nodes])
-    apart = jnp.linalg.norm(ends[:, None] - others[None], axis=-1)
-    is_taken = jnp.any(apart < 2 * PLANNING_RADIUS, axis=-1)
-    # Of two nodes on one path the farther one, or a robot that has reached a node would stay there.
-    remaining = jnp.append(0.0, 1.001 * to_view)
-    total = first + jnp.where(roadmap.is_free[poi, view], remaining, jnp.inf)
-    total = jnp.where(is_taken, jnp.inf, total)
-    best = jnp.argmin(total)
-    return total[best], ends[best]
-
-
-def _first(
-    config: Config,
-    layout: Layout,
-    roadmap: Roadmap,
-    position: Float[Array, "2"],
-    goals: Float[Array, "G 2"],
-) -> tuple[Float[Array, " G"], Float[Array, " K"]]:
-    """Lengths of free straight lines from a position to goals and to all nodes, else infinite."""
-    ends = jnp.concatenate([goals, roadmap.nodes])
-    length = _straight(position[None], ends, layout.position, _radius(config) - _MARGIN)[0]
-    return length[: len(goals)], length[len(goals) :]
-
-
-def _radius(config: Config) -> float:
-    """Minimum distance of paths between nodes from the centres of PoIs, in metres."""
-    return config.arena.poi_extent + PLANNING_RADIUS + _MARGIN
+    kept = jnp.float32(radius - _MARGIN)
+    return Roadmap(nodes, goals, between, is_next, is_free, centres, kept)
 
 
 def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], Bool[Array, "N V"]]:
@@ -215,7 +185,7 @@ def _straight(
     start: Float[Array, "A 2"],
     end: Float[Array, "E 2"],
     centres: Float[Array, "N 2"],
-    radius: float,
+    radius: Float[Array, ""] | float,
 ) -> Float[Array, "A E"]:
     """Lengths of straight lines between positions, infinite where they are not clear."""
     along_x, along_y = end[None, :, 0] - start[:, :1], end[None, :, 1] - start[:, 1:]
@@ -230,7 +200,7 @@ def _is_clear(
     start: Float[Array, "A 2"],
     end: Float[Array, "E 2"],
     centres: Float[Array, "N 2"],
-    radius: float,
+    radius: Float[Array, ""] | float,
 ) -> Bool[Array, "A E"]:
     """Whether straight lines between positions are clear of PoIs.
 

@@ -13,7 +13,7 @@ from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, pytree
 from jaxsense.mission import act, decide, navigation
-from jaxsense.mission.act import Course, where_due
+from jaxsense.mission.act import where_due
 from jaxsense.mission.state import (
     ENDED,
     FAILED,
@@ -86,20 +86,12 @@ def step(
     step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 2), out_axes=1)(keys)
     robot_keys, drift_keys, message_keys = step_keys[:-2], step_keys[-2], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
-    all_robots = jnp.arange(num_robots)
-    states, courses = jax.lax.scan(
-        lambda states, robot: _act(robot[1], mission, models, states, robot[0]),
-        states,
-        (all_robots, robot_keys),
-    )
-    # Nothing that robots do here changes where the others are.
-    steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
-    wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
-    robots = dataclasses.replace(states.robots, wanted=wanted)
-    states, clearance = move(mission, dataclasses.replace(states, robots=robots))
+    act_each = lambda states, robot: (_act(robot[1], mission, models, states, robot[0]), None)  # noqa: E731
+    states, _ = jax.lax.scan(act_each, states, (jnp.arange(num_robots), robot_keys))
+    states = move(mission, states)
     states = _drift(drift_keys, mission, before, states)
     robots = states.robots
-    is_idle = jnp.all((robots.phase == ENDED) | (robots.phase == FAILED), axis=-1)
+    is_idle = jnp.all(robots.phase >= ENDED, axis=-1)
     steps, settings = states.steps + 1, mission.config.mission
     is_late = steps * CONTROL_PERIOD >= settings.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
@@ -107,17 +99,15 @@ def step(
     keep = jax.vmap(jnp.where)
     states = jax.tree.map(lambda x, y: keep(before.done, x, y), before, after)
     records = Record(
-        time=mission.time(states),
+        time=states.time,
         poses=states.scene.poses,
         command=states.robots.command,
-        wanted=states.robots.wanted,
         phase=states.robots.phase,
         target=states.robots.target,
         scanned=states.robots.looks > before.robots.looks,
         detected=states.robots.detections > before.robots.detections,
         belief=states.belief,
         seen=states.seen,
-        clearance=clearance,
     )
     return states, records
 
@@ -128,26 +118,23 @@ def _act(
     models: Models,
     states: MissionState,
     robot: Int[Array, ""],
-) -> tuple[MissionState, Course]:
-    """Decides, sets a course and scans for one robot of each of B missions."""
+) -> MissionState:
+    """Decides, drives and scans with one robot of each of B missions."""
 
-    def choose(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Int[Array, " B"]:
+    def decided(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Robots:
         keys, states = rows
-        return decide.choices(keys, mission, models, states, robot, policy)
-
-    def set_out(rows: tuple[MissionState, Int[Array, " B"]], _) -> Robots:
-        alone = lambda state, chosen: decide.set_out(mission, models, state, robot, chosen)  # noqa: E731
-        return jax.vmap(alone)(*rows).robots
+        chosen = decide.choices(keys, mission, models, states, robot, policy)
+        set_out = lambda state, action: decide.set_out(mission, models, state, robot, action)  # noqa: E731
+        return jax.vmap(set_out)(states, chosen).robots
 
     choice_keys, scan_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     states = jax.vmap(lambda state: _fail(mission, state, robot))(states)
     due = jax.vmap(lambda state: decide.is_due(mission, state, robot))(states) & ~states.done
-    inputs, targets = (choice_keys, states), states.robots.target[:, robot]
-    chosen = where_due(due, choose, targets, inputs, kinds=states.policy)
-    robots = where_due(due, set_out, states.robots, (states, chosen))
+    inputs = choice_keys, states
+    robots = where_due(due, decided, states.robots, inputs, kinds=states.policy)
     states = dataclasses.replace(states, robots=robots)
-    states, course = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
-    return act.scan(scan_keys, mission, models, states, robot), course
+    states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
+    return act.scan(scan_keys, mission, models, states, robot)
 
 
 @jax.named_scope("mission.drift")
@@ -167,70 +154,61 @@ def _repeat_messages(key: Key, mission: Mission, state: MissionState) -> Mission
         return state
     sends = (state.steps % _MESSAGE_PERIODS == 0) & (state.robots.phase != FAILED)
     settings = mission.config.mission.communication
-    heard = state.memory.after_messages(key, settings, mission.time(state), sends)
+    heard = state.memory.after_messages(key, settings, state.time, sends)
     return dataclasses.replace(state, memory=heard)
 
 
 def _fail(mission: Mission, state: MissionState, robot: Index) -> MissionState:
     """Stops a robot when its time to fail has come."""
-    own = state.robot(robot)
-    fails = (mission.time(state) >= state.faults.stops_at[robot]) & (own.phase < ENDED)
+    phase, target = state.robots.phase[robot], state.robots.target[robot]
+    fails = (state.time >= state.faults.stops_at[robot]) & (phase < ENDED)
     return state.with_robot(
         robot,
-        phase=jnp.where(fails, FAILED, own.phase),
-        target=jnp.where(fails, mission.config.arena.num_pois, own.target),
+        phase=jnp.where(fails, FAILED, phase),
+        target=jnp.where(fails, mission.config.arena.num_pois, target),
     )
 
 
 @pytree
 class _Motion:
-    """Physics of B missions, and the smallest free distance [m] so far."""
+    """Physics of B missions."""
 
     poses: Float[Array, "B R 3"]
     velocity: Float[Array, "B R 3"]
     warmstart: Float[Array, "B V"]
     command: Float[Array, "B R 2"]
-    clearance: Float[Array, " B"]
 
 
 @jax.named_scope("mission.move")
-def move(mission: Mission, states: MissionState) -> tuple[MissionState, Float[Array, " B"]]:
+def move(mission: Mission, states: MissionState) -> MissionState:
     """Simulates one control period of B missions side by side.
 
     Contacts cost several times as much as everything else, and the planner avoids them. All robots
     move in an empty arena, and once more among PoIs and walls in the missions where one can touch
     anything within the period. In the others, both would result in the same motion.
-
-    Returns:
-      The `[B]` next states, and `[B]` the smallest free distance around any robot in the period, in
-      metres.
     """
-    config, robots, layout = mission.config, states.robots, states.scene.layout
-    poses = states.scene.poses
-    far = jnp.full(poses.shape[0], jnp.inf)
-    motion = _Motion(poses, states.velocity, states.warmstart, robots.command, far)
-    is_near = _is_near(config, layout, poses) & ~states.done
+    robots, layout, poses = states.robots, states.scene.layout, states.scene.poses
+    motion = _Motion(poses, states.velocity, states.warmstart, robots.command)
+    is_near = _is_near(mission.config, layout, poses) & ~states.done
     inputs = motion, robots.wanted, layout
     free = _integrate(mission, mission.free_arena, *inputs)
     among = lambda rows, _: _integrate(mission, mission.world.arena, *rows)  # noqa: E731
-    motion = where_due(is_near, among, free, inputs)
-    states = dataclasses.replace(
+    motion, clearance = where_due(is_near, among, free, inputs)
+    return dataclasses.replace(
         states,
         scene=dataclasses.replace(states.scene, poses=motion.poses),
         velocity=motion.velocity,
         warmstart=motion.warmstart,
         robots=dataclasses.replace(robots, command=motion.command),
-        contacts=states.contacts + (motion.clearance < 0),
-        min_clearance=jnp.minimum(states.min_clearance, motion.clearance),
+        contacts=states.contacts + (clearance < 0),
     )
-    return states, motion.clearance
 
 
 def _is_near(config: Config, layout: Layout, poses: Float[Array, "B R 3"]) -> Bool[Array, " B"]:
     """Whether any robot can touch anything within the period."""
     # Two robots may drive at each other; with a margin for the lag of the wheels.
     reach, lag = amiro.MAX_SPEED * CONTROL_PERIOD, 0.005
-    around = functools.partial(navigation.clearances, config.arena)
+    around = functools.partial(navigation.clearance, config.arena)
     to_fixed, to_robot = jax.vmap(around)(layout, poses)
     return jnp.any((to_fixed < reach + lag) | (to_robot < 2 * reach + lag), axis=-1)
 
@@ -242,8 +220,12 @@ def _integrate(
     motion: _Motion,
     wanted: Float[Array, "B R 2"],
     layout: Layout,
-) -> _Motion:
-    """Makes the physics steps, in each of which the commands approach the wanted ones."""
+) -> tuple[_Motion, Float[Array, " B"]]:
+    """Makes the physics steps, in each of which the commands approach the wanted ones.
+
+    Returns:
+      The motion, and the smallest free distance around any robot, in metres.
+    """
 
     def place_pois(layout: Layout, poses: jax.Array) -> tuple[jax.Array, jax.Array]:
         data = arenas.put(arena, layout, poses)
@@ -267,17 +249,15 @@ def _integrate(
             velocity=data.qvel.reshape(-1, 3),
             warmstart=data.qacc_warmstart,
             command=command,
-            clearance=motion.clearance,
         )
 
-    def substep(motion: _Motion, _) -> tuple[_Motion, None]:
+    def substep(motion: _Motion, _) -> tuple[_Motion, Float[Array, " B"]]:
         # The batch inside the loop: a loop inside a batch is traced over and over.
         after = jax.vmap(step)(motion, wanted, placed)
         with jax.named_scope("mission.clearance"):
             around = functools.partial(navigation.clearance, arena.config)
-            clearance = jnp.min(jax.vmap(around)(layout, after.poses), axis=-1)
-        smallest = jnp.minimum(motion.clearance, clearance)
-        return dataclasses.replace(after, clearance=smallest), None
+            return after, jnp.min(jnp.minimum(*jax.vmap(around)(layout, after.poses)), axis=-1)
 
     substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
-    return jax.lax.scan(substep, motion, length=substeps)[0]
+    motion, clearances = jax.lax.scan(substep, motion, length=substeps)
+    return motion, jnp.min(clearances, axis=0)

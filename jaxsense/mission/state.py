@@ -1,11 +1,12 @@
 """The state of missions, and the parts that all missions of a configuration share."""
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Mapping
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD
@@ -13,7 +14,7 @@ from jaxsense.config.section import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Policy, Values, table
-from jaxsense.mission.maps import Contents, Memory, OwnMap, SharedMap
+from jaxsense.mission.maps import Memory, OwnMap, SharedMap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
 from jaxsense.sim import sensors
@@ -28,7 +29,7 @@ RECENT_LOOKS = 32
 
 IDLE, DRIVING, FACING, BACKING, ENDED, FAILED = range(6)
 """Phases of a robot: asking its policy, driving to a viewpoint, turning to a PoI to scan it,
-backing off when stuck, ended by NOP, or failed."""
+backing off when stuck, and from `ENDED` on over: ended by NOP, or failed."""
 
 
 @pytree
@@ -106,7 +107,6 @@ class MissionState:
       memory: the looks that each robot knows of; None where all robots share one map.
       steps: control periods since the start.
       contacts: control periods in which a robot touched something.
-      min_clearance: smallest free distance around any robot since the start, in metres.
     """
 
     scene: Scene
@@ -121,12 +121,10 @@ class MissionState:
     log_posterior: Float[Array, "N C"]
     times_seen: Int[Array, "N M"]
     looked_from: Float[Array, "N M K 2"]
-    version: Int[Array, ""]
     memory: Memory | None
     robots: Robots
     steps: Int[Array, ""]
     contacts: Int[Array, ""]
-    min_clearance: Float[Array, ""]
     done: Bool[Array, ""]
 
     @property
@@ -139,20 +137,26 @@ class MissionState:
         """Which modalities have detected which PoI."""
         return self.times_seen > 0
 
-    def robot(self, robot: Index) -> Robots:
-        """State of one robot: the fields of `Robots` without their first axis."""
-        return jax.tree.map(lambda x: x[robot], self.robots)
+    @property
+    def version(self) -> Int[Array, "..."]:
+        """Version of the map of all looks: their number."""
+        return jnp.sum(self.times_seen, axis=(-2, -1))
 
-    def standing_robots(self, robot: Index) -> Float[Array, "_ 2"]:
-        """Positions of the other robots; moving ones, which will be gone, count as far away."""
-        phase = others(self.robots.phase, robot)
-        moves = (phase == DRIVING) | (phase == BACKING)
-        return jnp.where(moves[:, None], 1e3, others(self.believed_poses[:, :2], robot))
+    @property
+    def time(self) -> Float[Array, "..."]:
+        """Seconds since the start."""
+        return self.steps * CONTROL_PERIOD
 
     def with_robot(self, robot: Index, **changes: jax.Array) -> "MissionState":
         """Changes one robot."""
-        changed = {n: getattr(self.robots, n).at[robot].set(x) for n, x in changes.items()}
+        put = lambda rows, x: rows.at[robot].set(x, wrap_negative_indices=False)  # noqa: E731
+        changed = {name: put(getattr(self.robots, name), x) for name, x in changes.items()}
         return dataclasses.replace(self, robots=dataclasses.replace(self.robots, **changed))
+
+
+def rows_at(x: Shaped[Array, "R ..."], index: Index | Int[Array, " S"]) -> Shaped[Array, "..."]:
+    """One row or several, by indices from 0, which makes smaller programs than `x[index]`."""
+    return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 @pytree
@@ -162,21 +166,17 @@ class Record:
     Attributes:
       scanned: the robot took a scan.
       detected: the scan updated the map.
-      clearance: smallest free distance around any robot during it, in metres. After the mission's
-        end, of a motion that the state does not take.
     """
 
     time: Float[Array, ""]
     poses: Float[Array, "R 3"]
     command: Float[Array, "R 2"]
-    wanted: Float[Array, "R 2"]
     phase: Int[Array, " R"]
     target: Int[Array, " R"]
     scanned: Bool[Array, " R"]
     detected: Bool[Array, " R"]
     belief: Belief
     seen: Bool[Array, "N M"]
-    clearance: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,17 +216,45 @@ class Mission:
         """Index of each robot's sensor, int32."""
         return jnp.array(self.config.modality_of_robot)
 
-    def time(self, state: MissionState) -> Float[Array, "..."]:
-        """Seconds since the start."""
-        return state.steps * CONTROL_PERIOD
-
     def map_of(self, state: MissionState, robot: Index) -> SharedMap | OwnMap:
         """The map that a robot decides by."""
         if state.memory is None:
-            contents = Contents(state.belief, state.log_posterior, state.times_seen)
-            return SharedMap(contents, state.looked_from, state.version)
-        is_known = state.memory.known_to(robot, self.time(state))
+            looked_from = state.looked_from
+            return SharedMap(state.belief, state.log_posterior, state.times_seen, looked_from)
+        is_known = state.memory.known_to(robot, state.time)
         return OwnMap(state.memory, is_known, self.config.arena.num_pois)
+
+
+class Robot:
+    """One robot in a mission's state, with what it believes and knows.
+
+    Attributes:
+      pose: that it believes it has.
+      target: its target; the last PoI if it has none, so that an index is valid.
+      modality: index of its sensor.
+      map: that it decides by.
+    """
+
+    def __init__(self, mission: Mission, state: MissionState, index: Index):
+        """Works out what several decisions need."""
+        self.mission, self.state, self.index = mission, state, index
+        self.pose = state.believed_poses[index]
+        self.target = jnp.minimum(state.robots.target[index], mission.config.arena.num_pois - 1)
+        self.modality = mission.modalities[index]
+        self.map = mission.map_of(state, index)
+
+    @functools.cached_property
+    def own(self) -> Robots:
+        """Its part of the state."""
+        return jax.tree.map(lambda x: rows_at(x, self.index), self.state.robots)
+
+    @functools.cached_property
+    def standing(self) -> Float[Array, "_ 2"]:
+        """Positions of the other robots; moving ones, which will be gone, count as far away."""
+        phase = others(self.state.robots.phase, self.index)
+        moves = (phase == DRIVING) | (phase == BACKING)
+        places = others(self.state.believed_poses[:, :2], self.index)
+        return jnp.where(moves[:, None], 1e3, places)
 
 
 @checks.typed

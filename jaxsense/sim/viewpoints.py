@@ -102,7 +102,7 @@ def bearing(
 def free_room(
     x: Float[Array, "V"],
     y: Float[Array, "V"],
-    clearance: Float[Array, ""] | float,
+    clearance: Float[np.ndarray, "V"] | float,
     arena: ArenaConfig,
     layout: Layout,
     others: Float[Array, "K 2"],

@@ -5,13 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, NAIVE, alone, decide_alone, with_config, with_eyes
+from teams import CONFIG, alone, decide_alone, starting, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.mission import act, begin
-from jaxsense.mission.state import no_faults
-from jaxsense.sim.light import Light
+from jaxsense.mission import act
 
 
 @pytest.fixture(scope="session")
@@ -26,22 +24,7 @@ def models():
 
 @pytest.fixture(scope="session")
 def arena_of(team, models):
-    """A mission in a chosen arena: PoIs, robots' poses, classes, policy and faults."""
-
-    @jax.jit
-    def start(positions, poses, classes, policy, faults):
-        layout = jaxsense.sim.make_layout(CONFIG.arena, positions, jnp.zeros(len(classes)), classes)
-        light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
-        return begin.start(
-            team, models, jaxsense.sim.Scene(layout, light, poses), classes, policy, faults
-        )
-
-    def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
-        positions, poses = (np.array(x, np.float32) for x in (positions, poses))
-        faults = no_faults(CONFIG) if faults is None else faults
-        return start(positions, poses, np.array(classes), np.int32(policy), faults)
-
-    return make
+    return starting(team, models)
 
 
 @pytest.fixture(scope="session")
@@ -55,7 +38,7 @@ def set_robot():
         state = replace(state, robots=replace(state.robots, **robots))
         if "view" not in values:
             return state
-        ways, own = state.roadmap, state.robot(robot)
+        ways, own = state.roadmap, jax.tree.map(lambda x: x[robot], state.robots)
         view = jnp.minimum(own.view, ways.is_free.shape[1] - 1)
         to_view = state.robots.to_view.at[robot].set(ways.to_viewpoint(own.target, view))
         return replace(state, robots=replace(state.robots, to_view=to_view))

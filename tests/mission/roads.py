@@ -1,7 +1,5 @@
 """Arenas with PoIs at given places, and the ways among them."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 
@@ -21,18 +19,16 @@ EAST, NORTH, WEST, SOUTH = 0, 4, 8, 12
 OUTER = 16
 
 build = jax.jit(roadmap.build, static_argnums=0)
-lengths = jax.jit(roadmap.lengths, static_argnums=0)
+lengths = jax.jit(roadmap.Roadmap.lengths)
 
 
-@functools.partial(jax.jit, static_argnums=0)
-def next_waypoint(config, layout, ways, position, others, poi, view):
-    to_view = ways.to_viewpoint(poi, view)
-    return roadmap.next_waypoint(config, layout, ways, to_view, position, others, poi, view)
+@jax.jit
+def next_waypoint(ways, position, others, poi, view):
+    return ways.next_waypoint(ways.to_viewpoint(poi, view), position, others, poi, view)
 
 
 def planned(config, positions):
-    """The first arguments of `lengths` and `next_waypoint`."""
+    """The ways among PoIs at some places."""
     number = len(positions)
     position, classes = jnp.array(positions, jnp.float32), jnp.zeros(number, jnp.int32)
-    layout = sim.make_layout(config.arena, position, jnp.zeros(number), classes)
-    return config, layout, build(config, layout)
+    return build(config, sim.make_layout(config.arena, position, jnp.zeros(number), classes))

@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsense import dqn, mission
+from jaxsense import dqn, mission, sim
 from jaxsense.config import PRESETS
 from jaxsense.core.types import pytree
-from jaxsense.mission import decide
+from jaxsense.mission import begin, decide
+from jaxsense.mission.state import no_faults
+from jaxsense.sim.light import Light
 from jaxsense.vae import detectors, readout
 
 # Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
@@ -20,12 +22,33 @@ LATENT, NAIVE = POLICIES.index("latent"), POLICIES.index("naive")
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
 POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
 POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
+# Of which PoI 0 is 0.8 m ahead of a robot at the origin.
+AHEAD = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 
 
 def with_config(team, config):
     """The same mission with other numbers, which may be traced."""
     arenas = team.world.arena, team.free_arena
     return mission.make_mission(config, team.policies, arenas=arenas)
+
+
+def starting(team, models):
+    """Starts missions in chosen arenas: PoIs, robots' poses, classes, policy and faults."""
+
+    @jax.jit
+    def start(positions, poses, classes, policy, faults):
+        yaw = jnp.zeros(len(classes))
+        layout = sim.make_layout(team.config.arena, positions, yaw, classes)
+        light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
+        scene = sim.Scene(layout, light, poses)
+        return begin.start(team, models, scene, classes, policy, faults)
+
+    def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
+        positions, poses = (np.array(x, np.float32) for x in (positions, poses))
+        faults = no_faults(team.config) if faults is None else faults
+        return start(positions, poses, np.array(classes), np.int32(policy), faults)
+
+    return make
 
 
 def with_class_beliefs(models, classes):
@@ -96,7 +119,9 @@ def with_values(models, *values):
 
 
 def decide_alone(key, mission, models, state, robot):
-    """The state after a decision of one robot in one mission."""
+    """The state after a decision of one robot in one mission, if one is due."""
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
     chosen = decide.choices(key[None], mission, models, batch, robot, batch.policy[0])[0]
-    return decide.set_out(mission, models, state, robot, chosen)
+    after = decide.set_out(mission, models, state, robot, chosen)
+    due = decide.is_due(mission, state, robot)
+    return jax.tree.map(lambda x, y: jnp.where(due, x, y), after, state)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG
+from teams import AHEAD, CONFIG
 
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.mission import act
@@ -22,8 +22,6 @@ from jaxsense.mission.state import (
 )
 from jaxsense.vae.novelty import Novelty
 
-# PoI 0 is 0.8 m ahead of the robot under test, a red cube.
-POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 CAMERA, LIDAR = 0, 1
 AWAY = [0.0, 1.2, 0.0]
 IN_THE_VIEW = [0.4, 0.0, 0.0]
@@ -34,7 +32,7 @@ BLIND = Faults(jnp.full(2, jnp.inf), jnp.full(2, 0.0))
 def facing(arena_of, set_robot):
     def make(robot, pose=(0.0, 0.0, 0.0), other=AWAY, faults=None):
         poses = [list(pose), other] if robot == CAMERA else [other, list(pose)]
-        state = arena_of(POSITIONS, poses, classes=(2, 0, 1), faults=faults)
+        state = arena_of(AHEAD, poses, classes=(2, 0, 1), faults=faults)
         # It has waited long enough to scan whatever is in the way.
         return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
 
@@ -180,11 +178,7 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
 
 @pytest.fixture(scope="module")
 def approach(team, models):
-    def approach_and_steer(state, robot):
-        state, course = act.approach(team, models, state, robot)
-        return state.with_robot(robot, wanted=act.steer(team, state, robot, course))
-
-    return jax.jit(approach_and_steer)
+    return jax.jit(lambda state, robot: act.approach(team, models, state, robot))
 
 
 def driving(state, set_robot, view, seconds, progress_at, path_left=0.1):

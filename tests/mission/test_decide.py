@@ -108,7 +108,6 @@ def without_ways(state):
         state.roadmap,
         is_free=state.roadmap.is_free.at[2].set(False),
         is_next=state.roadmap.is_next.at[2].set(False),
-        leads=state.roadmap.leads.at[2].set(False),
     )
     return replace(state, roadmap=ways)
 
@@ -130,14 +129,14 @@ def test_where_a_robot_was_stuck_it_tries_again_once_before_it_ends(chosen, set_
 
 @pytest.mark.parametrize("phase", [DRIVING, FACING])
 @pytest.mark.parametrize("policy", [LATENT, NAIVE])
-@pytest.mark.parametrize(("version", "target"), [(1, 2), (0, 0)])
+@pytest.mark.parametrize(("decided_on", "target"), [(0, 2), (2, 0)])
 def test_a_changed_map_makes_a_robot_decide_again(
-    chosen, set_robot, phase, policy, version, target
+    chosen, set_robot, phase, policy, decided_on, target
 ):
     def under_way(state):
         # Of the naive policy only PoI 2 is left, which is the best of the latent one.
-        state = seen_by([1, 1, 0])(replace(state, version=jnp.int32(version)))
-        return set_robot(state, 0, phase=phase, target=0, goals=1, attempts=1)
+        own = {"phase": phase, "target": 0, "goals": 1, "attempts": 1}
+        return set_robot(seen_by([1, 1, 0])(state), 0, **own, decided_on=decided_on)
 
     state = chosen([0.0, 0.0, 1.0, 0.5], policy, under_way)
     assert state.robots.target[0] == target

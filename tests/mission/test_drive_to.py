@@ -4,10 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from navigating import ARENA, PERIOD, layout_of
 
 from jaxsense import sim
+from jaxsense.config.scene import ArenaConfig
 from jaxsense.mission import navigation
+
+ARENA, PERIOD = ArenaConfig(), 0.1  # s
+
+
+def layout_of(*positions):
+    """A layout with cylinders at some places and the others, of three, far outside."""
+    outside = [[9.0, 9.0], [-9.0, 9.0], [9.0, -9.0]]
+    position = jnp.array([*positions, *outside[len(positions) :]], jnp.float32)
+    return sim.make_layout(ARENA, position, jnp.zeros(3), jnp.zeros(3, jnp.int32))
 
 
 def turned(angle, x, y):
@@ -170,7 +179,7 @@ def move(layout, poses, commands, wanted):
         heading = poses[:, 2] + 0.005 * turn
         velocity = jnp.stack([forward * jnp.cos(heading), forward * jnp.sin(heading), turn], -1)
         poses += 0.01 * velocity
-        return (poses, commands), jnp.min(navigation.clearance(ARENA, layout, poses))
+        return (poses, commands), jnp.min(jnp.minimum(*navigation.clearance(ARENA, layout, poses)))
 
     (poses, commands), clearance = jax.lax.scan(step, (poses, commands), length=10)
     return poses, commands, jnp.min(clearance)

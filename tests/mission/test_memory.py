@@ -17,7 +17,7 @@ from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.mission import maps
 from jaxsense.mission.begin import start
-from jaxsense.mission.maps import MOST_LOOKS, Contents, Evidence, OwnMap, SharedMap
+from jaxsense.mission.maps import MOST_LOOKS, Evidence, OwnMap, SharedMap
 from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
@@ -151,13 +151,14 @@ def test_looks_one_by_one_come_to_the_shared_map(own_models):
     fusion, held = own_models.fusion, maps.empty(MODALITY, 3)
     tiled = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), fusion.prior)
     prior = jnp.tile(own_models.bayes.prior, (2, 1))
-    shared = Contents(tiled, prior, jnp.zeros((2, 2), jnp.int32))
+    nowhere = jnp.full((2, 2, 1, 2), jnp.inf)
+    shared = SharedMap(tiled, prior, jnp.zeros((2, 2), jnp.int32), nowhere)
     rng = np.random.default_rng(0)
 
     @functools.partial(jax.jit, static_argnums=3)
     def learn(shared, held, features, modality, weight):
         args = own_models, jnp.int32(1), features, modality, weight
-        found = SharedMap(shared, jnp.zeros(0), jnp.int32(0)).learn(*args)
+        found = shared.learn(*args)
         return found, OwnMap(held, held.taken(), 2).learn(*args)
 
     for look in range(6):

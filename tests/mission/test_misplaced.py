@@ -6,16 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, POSES, POSITIONS, with_config
+from teams import AHEAD, CONFIG, POSES, POSITIONS, with_config
 
 from jaxsense import mission
 from jaxsense.config.mission import LocalisationConfig, Search
 from jaxsense.mission import act, decide
 from jaxsense.mission.rollout import _drift
-from jaxsense.mission.state import DRIVING, FACING
+from jaxsense.mission.state import DRIVING, FACING, Robot
 
 CAMERA, LIDAR = 0, 1
-AHEAD = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 AWAY = [0.0, 1.2, 0.0]
 
 
@@ -62,9 +61,12 @@ def test_a_detector_is_given_the_distance_that_the_robot_believes(scan, facing):
 def test_a_robot_that_searches_looks_from_farther_away(team, facing):
     # It is .35 m from the PoI, and looks from .3 m and farther.
     state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
-    sees = jax.jit(
-        lambda config, state: decide.sees(with_config(team, config), state, CAMERA, jnp.int32(0))
-    )
+
+    @jax.jit
+    def sees(config, state):
+        robot = Robot(with_config(team, config), state, CAMERA)
+        return decide.views(robot, jnp.int32(0), state.roadmap.viewpoints[0])[1]
+
     for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
         assert bool(sees(searching(Search(position=position)), state)) is expected
 
@@ -76,7 +78,7 @@ def searching(search):
 
 
 def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):
-    approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA)[0])
+    approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA))
     viewpoint = facing(CAMERA, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).roadmap.viewpoints[0, 0]
     there, short = [*viewpoint, 0.0], [viewpoint[0] + 0.25, viewpoint[1], 0.0]
     for pose, error, phase in (

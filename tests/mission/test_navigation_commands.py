@@ -1,16 +1,15 @@
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from navigating import ARENA
 
 from jaxsense import sim
-from jaxsense.config.scene import SHAPES
+from jaxsense.config.scene import SHAPES, ArenaConfig
 from jaxsense.mission import navigation
 from jaxsense.sim import amiro
+
+ARENA = ArenaConfig()
 
 
 @pytest.mark.parametrize(
@@ -69,7 +68,7 @@ def test_a_robot_turns_to_face_a_bearing_at_four_per_second_and_at_most_one(bear
 
 @pytest.fixture(scope="module")
 def clearance():
-    return jax.jit(functools.partial(navigation.clearance, ARENA))
+    return jax.jit(lambda *given: jnp.minimum(*navigation.clearance(ARENA, *given)))
 
 
 # The directions of a side and of a corner of the cube at (0, 1), which is turned by 30 degrees.

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import CONFIG, POLICIES, with_class_beliefs
+from teams import AHEAD, CONFIG, POLICIES, with_class_beliefs
 
 from jaxsense import mission
 from jaxsense.core.types import Belief
@@ -14,7 +14,6 @@ from jaxsense.mission import outcome
 from jaxsense.mission.outcome import REASONS, reason
 from jaxsense.mission.state import DRIVING, ENDED, FAILED
 
-POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 POSES = [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]]
 # Green cylinder, red cylinder, red cube.
 MEANS = jnp.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0]])
@@ -27,7 +26,7 @@ def known(models):
 
 @pytest.fixture
 def ended(arena_of):
-    state = arena_of(POSITIONS, POSES, classes=(0, 1, 2))
+    state = arena_of(AHEAD, POSES, classes=(0, 1, 2))
     robots = replace(state.robots, phase=jnp.full(2, ENDED))
     return replace(state, robots=robots, done=jnp.bool_(True), steps=jnp.int32(123))
 

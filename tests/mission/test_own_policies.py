@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import pytest
-from teams import CONFIG, decide_alone
+from teams import CONFIG, POSES, POSITIONS, decide_alone
 
 from jaxsense import evaluate, mission, train
 from jaxsense.config import ConfigError
@@ -15,10 +15,6 @@ from jaxsense.mission.outcome import require_playable
 from jaxsense.mission.state import DRIVING, FAILED
 from jaxsense.run import output, pipeline, programs
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-
-# The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.
-POSITIONS = [[1.0, 0.0], [0.0, 0.8], [-1.0, -1.25]]
-POSES = [[0.0, 0.0, 0.0], [1.2, 1.2, 0.0]]
 
 
 def last_first(key, models, known):

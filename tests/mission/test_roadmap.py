@@ -34,14 +34,6 @@ WALLED_IN = Config(
 ANGLES = np.arange(8) * np.pi / 4
 RING = np.concatenate([np.zeros((1, 2)), 0.6 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1)])
 
-reachable = jax.jit(roadmap.reachable, static_argnums=0)
-
-
-@jax.jit
-def last_parts(ways):
-    """`[N, V, K]` lengths from nodes straight to viewpoints."""
-    return jax.vmap(lambda poi: ways.last(poi, slice(None)))(jnp.arange(len(ways.viewpoints)))
-
 
 @jax.jit
 def to_viewpoints(ways):
@@ -55,7 +47,7 @@ def to_viewpoints(ways):
 def test_viewpoints_lie_all_around_at_the_configured_distances(poi):
     config = Config()
     position = np.array([[0.3, -0.2], [-0.9, 0.9], [1.0, 1.0]])
-    _, _, ways = planned(config, position)
+    ways = planned(config, position)
     assert ways.viewpoints.shape == (3, 2 * 16, 2)
     away = np.array(ways.viewpoints[poi]) - position[poi]
     distance = np.linalg.norm(away, axis=-1).reshape(2, 16)
@@ -73,7 +65,7 @@ def test_a_way_is_straight_if_it_keeps_the_planning_radius(passes_at, is_straigh
     # the planning radius is 0.241421.
     sine = passes_at / 0.9
     start = jnp.array([0.9 - 1.8 * np.sqrt(1 - sine**2), 1.8 * sine])
-    length, place = next_waypoint(*planned(ALONE, [[0.0, 0.0]]), start, FAR_AWAY, 0, OUTER + EAST)
+    length, place = next_waypoint(planned(ALONE, [[0.0, 0.0]]), start, FAR_AWAY, 0, OUTER + EAST)
     assert np.allclose(place, [0.9, 0.0], atol=1e-6) == is_straight
     assert length == pytest.approx(1.8, abs=1e-5) if is_straight else 1.8 < length < 1.81
 
@@ -100,7 +92,7 @@ def test_ways_are_the_shortest_that_dijkstra_finds(arena):
     config = Config(arena=arena)
     classes = jnp.zeros(arena.num_pois, jnp.int32)
     layout = sim.random_layout(jax.random.key(1), arena, classes)
-    _, _, ways = planned(config, layout.position)
+    ways = planned(config, layout.position)
     ways, centres = jax.tree.map(np.asarray, (ways, layout.position))
     nodes, places = ways.nodes, ways.viewpoints[ways.is_free]
     starts = np.concatenate([nodes, places])
@@ -113,12 +105,10 @@ def test_ways_are_the_shortest_that_dijkstra_finds(arena):
     shortest = csgraph.dijkstra(graph, indices=np.arange(len(nodes), len(starts)))
     assert np.isfinite(edges[: len(nodes)]).mean() < 0.7
     expected = shortest[:, : len(nodes)]
-    between, last = ways.between, np.asarray(last_parts(ways))
+    last = np.asarray(ways.last())
     found = np.asarray(to_viewpoints(ways))[ways.is_free]
     np.testing.assert_allclose(found, expected, atol=1e-5)
     np.testing.assert_array_equal(last[~ways.is_free], np.inf)
-    leads = np.isfinite(last[:, :, None] + between).any(axis=(1, 3))
-    np.testing.assert_array_equal(ways.leads, leads)
 
 
 def test_a_place_reaches_the_pois_with_a_way_of_finite_length():
@@ -127,12 +117,10 @@ def test_a_place_reaches_the_pois_with_a_way_of_finite_length():
     shares = []
     for pois in (RING, opened):
         plan = planned(WALLED_IN, pois)
-        each = jax.vmap(lambda place, poi, plan=plan: lengths(*plan, place, poi), in_axes=(None, 0))
-        length = jax.vmap(each, in_axes=(0, None))(places, jnp.arange(9))
-        expected = np.isfinite(length).any(axis=-1)
-        found = jax.vmap(lambda place, plan=plan: reachable(*plan, place))(places)
-        np.testing.assert_array_equal(found, expected)
-        shares.append(expected[:, 0].mean())
+        found = jax.vmap(lambda place, plan=plan: lengths(plan, place))(places)
+        of_one = jax.vmap(lambda place, plan=plan: lengths(plan, place, 3))(places)
+        np.testing.assert_array_equal(of_one, found[:, 3])
+        shares.append(np.isfinite(found[:, 0]).any(axis=-1).mean())
     # Within the ring, and from nearly everywhere.
     assert 0.02 < shares[0] < 0.25
     assert shares[1] > 0.9
@@ -156,14 +144,14 @@ def beside_wall_and_poi():
     ],
 )
 def test_only_free_viewpoints_have_a_way(beside_wall_and_poi, view, is_free):
-    ways = beside_wall_and_poi[2]
+    ways = beside_wall_and_poi
     here = ways.viewpoints[0, view]
     expected = 0.0 if is_free else np.inf
     assert ways.is_free[0, view] == is_free
     assert np.isinf(ways.last(0, view)).all() != is_free
     # Even from where it is.
-    assert lengths(*beside_wall_and_poi, here, 0)[view] == expected
-    length, place = next_waypoint(*beside_wall_and_poi, here, FAR_AWAY, 0, view)
+    assert lengths(beside_wall_and_poi, here, 0)[view] == expected
+    length, place = next_waypoint(beside_wall_and_poi, here, FAR_AWAY, 0, view)
     assert length == expected
     if is_free:
         np.testing.assert_array_equal(place, here)
@@ -172,12 +160,12 @@ def test_only_free_viewpoints_have_a_way(beside_wall_and_poi, view, is_free):
 @pytest.mark.parametrize("offset", [0.0, 0.034])
 def test_a_robot_near_a_node_is_led_on_to_the_next(offset):
     # Up to 0.035 m from it, on any side, it sees the next one.
-    plan = planned(ALONE, [[0.0, 0.0]])
+    ways = planned(ALONE, [[0.0, 0.0]])
     sides = np.linspace(0, 2 * np.pi, 12, endpoint=False)
-    nodes = plan[2].nodes[:, None]
+    nodes = ways.nodes[:, None]
     places = nodes + offset * jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)[None]
     assert np.linalg.norm(places, axis=-1).min() > KEEP
-    lead = functools.partial(next_waypoint, *plan)
+    lead = functools.partial(next_waypoint, ways)
     by_view = jax.vmap(lead, in_axes=(None, None, None, 0))
     by_place = jax.vmap(by_view, in_axes=(0, None, None, None))
     length, place = by_place(places.reshape(-1, 2), FAR_AWAY, 0, jnp.arange(2 * OUTER))
@@ -199,12 +187,12 @@ def followed():
         apart = jnp.linalg.norm(places[:, None] - layout.position[None], axis=-1).min(axis=-1)
         start = places[jnp.argmax(apart >= KEEP)]
         poi = jax.random.randint(poi_key, (), 0, 3)
-        length = roadmap.lengths(CONFIG, layout, ways, start, poi)
+        length = ways.lengths(start, poi)
         draws = jax.random.uniform(view_key, length.shape)
         view = jnp.argmax(jnp.where(jnp.isfinite(length), draws, -1.0))
 
         def step(place, _):
-            left, waypoint = next_waypoint(CONFIG, layout, ways, place, FAR_AWAY, poi, view)
+            left, waypoint = next_waypoint(ways, place, FAR_AWAY, poi, view)
             away = waypoint - place
             share = jnp.minimum(0.02 / jnp.maximum(jnp.linalg.norm(away), 1e-9), 1.0)
             return place + share * away, (place, left)
@@ -245,10 +233,10 @@ def test_following_the_next_waypoint_keeps_off_pois_and_walls(followed):
 def test_the_next_waypoint_is_not_where_another_robot_stands(start, offset, is_taken):
     # From the first two a node is the next place to (0.9, 0), from the last one that itself.
     # Two robots with 0.1 each stand there if their middles are less than 0.2 apart.
-    args = *planned(ALONE, [[0.0, 0.0]]), jnp.array(start)
+    args = planned(ALONE, [[0.0, 0.0]]), jnp.array(start)
     length, place = next_waypoint(*args, FAR_AWAY, 0, OUTER + EAST)
     # Beyond it, where no other place of the way is near.
-    other = place + offset * (place - args[3]) / jnp.linalg.norm(place - args[3])
+    other = place + offset * (place - args[1]) / jnp.linalg.norm(place - args[1])
     others = jnp.stack([FAR_AWAY[0], other])
     detour, aside = next_waypoint(*args, others, 0, OUTER + EAST)
     assert detour >= length

@@ -116,14 +116,6 @@ def reasons(state):
     return [REASONS[code] for code in jax.vmap(reason)(state)]
 
 
-def test_the_smallest_clearance_is_that_of_the_records_until_the_end(healthy):
-    _, end, record = healthy
-    is_over = np.arange(STEPS) >= end.steps[:, None]
-    assert is_over.any(axis=1).all()
-    until_end = np.where(is_over, np.inf, record.clearance)
-    np.testing.assert_array_equal(until_end.min(axis=1), end.min_clearance)
-
-
 def test_every_robot_visits_every_poi_once_and_ends(healthy):
     _, end, record = healthy
     assert reasons(end) == ["finished"] * NUM_ARENAS
@@ -135,9 +127,8 @@ def test_every_robot_visits_every_poi_once_and_ends(healthy):
 
 def test_limits_of_speed_and_acceleration_hold(healthy):
     _, _, record = healthy
-    for commands in (record.command, record.wanted):
-        assert np.all(np.abs(commands[..., 0]) <= amiro.MAX_SPEED + 1e-6)
-        assert np.all(np.abs(commands[..., 1]) <= amiro.MAX_TURN_RATE + 1e-6)
+    assert np.all(np.abs(record.command[..., 0]) <= amiro.MAX_SPEED + 1e-6)
+    assert np.all(np.abs(record.command[..., 1]) <= amiro.MAX_TURN_RATE + 1e-6)
     change = np.abs(np.diff(record.command, axis=1)) / PERIOD
     assert np.all(change[..., 0] <= amiro.MAX_ACCELERATION + 1e-4)
     assert np.all(change[..., 1] <= amiro.MAX_TURN_ACCELERATION + 1e-4)

@@ -33,7 +33,7 @@ def started():
 
         def look(pose):
             def reached(poi):
-                return jnp.isfinite(roadmap.lengths(CONFIG, layout, ways, pose[:2], poi).min())
+                return jnp.isfinite(ways.lengths(pose[:2], poi).min())
 
             to_pois = jnp.linalg.norm(layout.position - pose[None, :2], axis=-1)
             return jnp.min(to_pois) - KEEP, jnp.all(jax.vmap(reached)(jnp.arange(16)))
@@ -61,7 +61,7 @@ def test_robots_start_at_the_first_places_with_room_and_ways_to_all_pois(started
             only_cut_off += np.any((has_room & is_apart & ~has_ways[robot])[:first])
             only_too_close += np.any((has_room & has_ways[robot] & ~is_apart)[:first])
     assert number > 120
-    assert latest >= 2 * begin._CHECKED_AT_ONCE
+    assert latest >= 8
     # All conditions matter.
     assert only_cut_off > 0
     assert only_too_close > 0

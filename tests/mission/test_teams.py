@@ -7,26 +7,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from teams import (
+    AHEAD,
     CONFIG,
     LATENT,
     NAIVE,
     POLICIES,
     alone,
     decide_alone,
+    starting,
     with_values,
 )
 
-import jaxsense
 from jaxsense import mission
 from jaxsense.mission import act
-from jaxsense.mission.begin import start
-from jaxsense.mission.state import DRIVING, FACING, no_faults
-from jaxsense.sim.light import Light
+from jaxsense.mission.state import DRIVING, FACING
 
 TEAM = replace(CONFIG, robots=("camera", "camera", "lidar"))
 FIRST, SECOND, LIDAR = 0, 1, 2
 # The PoIs are 0.8 m from the first, the second and the third robot, of which each faces its own.
-POSITIONS = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 POSES = [[0.0, 0.0, 0.0], [-0.2, 1.0, np.pi], [-0.2, -1.0, np.pi]]
 
 
@@ -37,17 +35,8 @@ def many():
 
 @pytest.fixture(scope="module")
 def start_of(many, models):
-    begin = jax.jit(lambda *given: start(many, models, *given))
-
-    def make(poses=POSES, policy=NAIVE, faults=None, classes=(2, 0, 1)):
-        classes = jnp.array(classes)
-        layout = jaxsense.sim.make_layout(TEAM.arena, jnp.array(POSITIONS), jnp.zeros(3), classes)
-        light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
-        scene = jaxsense.sim.Scene(layout, light, jnp.array(poses, jnp.float32))
-        faults = no_faults(TEAM) if faults is None else faults
-        return begin(scene, classes, jnp.int32(policy), faults)
-
-    return make
+    start = starting(many, models)
+    return lambda poses=POSES, policy=NAIVE: start(AHEAD, poses, (2, 0, 1), policy)
 
 
 @pytest.fixture(scope="module")
