@@ -35,27 +35,20 @@ def test_no_number_is_a_constant_of_a_program():
     assert constants[0] == constants[1]
 
 
-def lowered(config, names=None):
-    """The programs of a run as text, by their names; of these stages alone, and of no missions."""
+def lowered(config):
+    """The programs of a run as text, by their names."""
     found = {}
 
     def compile_one(self, function, *args, **options):
         program = jax.jit(function).trace(*args)
-        if names is None or self._stage.removeprefix("jmvae") in map(as_stage, names):
-            found[f"{self._stage}-{self._name}"] = program.lower().as_text()
+        found[f"{self._stage}-{self._name}"] = program.lower().as_text()
         return program.out_info
-
-    def as_stage(name):
-        return name.removesuffix("_1").removeprefix("jmvae")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Program, "compile", compile_one)
-        if names is not None:
-            patch.setattr(Programs, "_compile_missions", lambda programs: None)
         with Compiler(Monitor()) as compiler:
             made = Programs(config, compiler)
             for stage in made.stages:
                 made.of(stage).shapes.result()
-            if names is None:
-                made.player.result()
+            made.player.result()
     return found

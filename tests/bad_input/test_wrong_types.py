@@ -24,15 +24,28 @@ FUNCTIONS = {
 }
 
 
+def call(name, arguments):
+    """Calls a function with some arguments by position, as far as they may be."""
+    kinds = {p.name: p.kind for p in required(FUNCTIONS[name])}
+    named = {n: x for n, x in arguments.items() if kinds[n] is inspect.Parameter.KEYWORD_ONLY}
+    FUNCTIONS[name](*(x for n, x in arguments.items() if n not in named), **named)
+
+
 @pytest.mark.parametrize("value", [None, "x", 0.5j], ids=repr)
 @pytest.mark.parametrize("name", sorted(FUNCTIONS))
 def test_a_value_of_a_wrong_type_is_named_in_one_line(name, value):
-    function = FUNCTIONS[name]
-    parameters = required(function)
+    parameters = required(FUNCTIONS[name])
     with pytest.raises(ValueError, match=r"^[^\n]+$") as refused:
-        function(
-            *(value for p in parameters if p.kind is not p.KEYWORD_ONLY),
-            **{p.name: value for p in parameters if p.kind is p.KEYWORD_ONLY},
-        )
+        call(name, {p.name: value for p in parameters})
     message = str(refused.value)
     assert any(message.startswith(p.name) for p in parameters) or repr(value)[1:-1] in message
+
+
+@pytest.mark.parametrize(
+    "name", [name for name in sorted(FUNCTIONS) if required(FUNCTIONS[name])[0].name == "key"]
+)
+def test_a_seed_is_no_key(name):
+    """Before anything else is looked at."""
+    others = {p.name: None for p in required(FUNCTIONS[name])}
+    with pytest.raises(ValueError, match="key = 7: must be one key"):
+        call(name, {**others, "key": 7})

@@ -1,7 +1,6 @@
 """The class belongs to the tree definition: no program of one class runs with another."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +11,6 @@ from flax import serialization
 from jaxsense import sim
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn.rewards import Nats, Paper
 
 
 def own_reward(value):
@@ -40,15 +38,6 @@ def wrong_programs(number):
 
 def test_a_class_that_is_defined_again_runs_its_own_program():
     assert wrong_programs(12) == 0
-
-
-def test_classes_with_equal_fields_have_different_tree_definitions():
-    blank = [Nats(0.1), Paper(0.1), *(own_reward(0)(0.1) for _ in range(8))]
-    trees = [jax.tree.structure(each) for each in blank]
-    pairs = list(itertools.combinations(trees, 2))
-    assert len(pairs) == 45
-    assert not any(a == b for a, b in pairs)
-    assert all(a == jax.tree.structure(each) for a, each in zip(trees, blank, strict=True))
 
 
 def test_state_dictionaries_are_those_of_earlier_checkpoints():

@@ -17,10 +17,6 @@ def env():
     return made.TeamEnv(small.team(), small.TEAM)
 
 
-def first_actions(masks):
-    return {agent: jnp.int32(np.argmax(mask)) for agent, mask in masks.items()}
-
-
 def test_agents_and_spaces_are_those_of_the_robots(env):
     from jaxmarl.environments import MultiAgentEnv
 
@@ -50,23 +46,6 @@ def test_an_ended_episode_starts_again_in_the_same_step(env):
         lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), (observations, state), start
     )
     assert not state.done
-
-
-@pytest.mark.slow
-def test_the_log_wrapper_sums_rewards(env):
-    from jaxmarl.wrappers.baselines import LogWrapper
-
-    logged = LogWrapper(env)
-    _, state = logged.reset(jax.random.key(9))
-    total = np.zeros(3)
-    for i in range(12):
-        actions = first_actions(env.get_avail_actions(state.env_state))
-        _, state, rewards, dones, infos = logged.step(jax.random.key(i), state, actions)
-        total = total + np.array([rewards[agent] for agent in AGENTS])
-        assert infos["returned_episode"].tolist() == [i == 11] * 3
-    assert dones["__all__"]
-    np.testing.assert_allclose(infos["returned_episode_returns"], total, rtol=1e-5)
-    assert (total != 0).all()
 
 
 def test_a_robot_without_an_action_is_named(env):

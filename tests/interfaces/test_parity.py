@@ -119,7 +119,7 @@ def of_pettingzoo(task):
 
 ADAPTERS = {
     "gymnasium": of_gymnasium_alone,
-    "gymnasium vector": functools.partial(of_gymnasium, rows=2),
+    "gymnasium vector": functools.partial(of_gymnasium, rows=3),
     "stable_baselines3": of_stable_baselines3,
     "gymnax": of_gymnax,
     "rejax": functools.partial(of_gymnax, name="rejax"),
