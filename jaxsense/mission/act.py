@@ -152,7 +152,7 @@ def scan(
     def scanned(rows: tuple[Key, MissionState], _) -> dict[str, PyTree]:
         keys, states = rows
         keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-        aims = jax.vmap(lambda *row: _aim(mission, models, robot, *row))(keys[0], states)
+        aims = jax.vmap(functools.partial(_aim, mission, models, robot))(keys[0], states)
 
         def look(i: int) -> tuple[Bool[Array, " S"], Learned]:
             alone = functools.partial(_look, mission, models, robot, carried[i])
@@ -160,7 +160,8 @@ def scan(
 
         # The choice of the sensor outside the batch: inside, all would scan.
         found = call(look, which, len(carried))
-        return written(jax.vmap(lambda *row: _write(mission, robot, *row))(keys[2], states, *found))
+        write = jax.vmap(functools.partial(_write, mission, robot))
+        return written(write(keys[2], states, *found))
 
     scans = jax.vmap(lambda state: _scans(Robot(mission, state, robot)))(states)
     after = where_due(scans & ~states.done, scanned, written(states), (keys, states))

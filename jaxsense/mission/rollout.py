@@ -86,14 +86,11 @@ def step(
     step_keys = jax.vmap(lambda key: jax.random.split(key, num_robots + 2), out_axes=1)(keys)
     robot_keys, drift_keys, message_keys = step_keys[:-2], step_keys[-2], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
-    act_each = lambda states, robot: (_act(robot[1], mission, models, states, robot[0]), None)  # noqa: E731
+    act_each = functools.partial(_act, mission, models)
     states, _ = jax.lax.scan(act_each, states, (jnp.arange(num_robots), robot_keys))
-    states = move(mission, states)
-    states = _drift(drift_keys, mission, before, states)
-    robots = states.robots
-    is_idle = jnp.all(robots.phase >= ENDED, axis=-1)
-    steps, settings = states.steps + 1, mission.config.mission
-    is_late = steps * CONTROL_PERIOD >= settings.time_limit
+    states = _drift(drift_keys, mission, before, move(mission, states))
+    is_idle, steps = jnp.all(states.robots.phase >= ENDED, axis=-1), states.steps + 1
+    is_late = steps * CONTROL_PERIOD >= mission.config.mission.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
     after = jax.vmap(lambda key, state: _repeat_messages(key, mission, state))(message_keys, after)
     keep = jax.vmap(jnp.where)
@@ -113,13 +110,10 @@ def step(
 
 
 def _act(
-    keys: Key,
-    mission: Mission,
-    models: Models,
-    states: MissionState,
-    robot: Int[Array, ""],
-) -> MissionState:
-    """Decides, drives and scans with one robot of each of B missions."""
+    mission: Mission, models: Models, states: MissionState, turn: tuple[Int[Array, ""], Key]
+) -> tuple[MissionState, None]:
+    """Decides, drives and scans with one robot of each of B missions, whose turn it is."""
+    robot, keys = turn
 
     def decided(rows: tuple[Key, MissionState], policy: Int[Array, ""]) -> Robots:
         keys, states = rows
@@ -134,7 +128,7 @@ def _act(
     robots = where_due(due, decided, states.robots, inputs, kinds=states.policy)
     states = dataclasses.replace(states, robots=robots)
     states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
-    return act.scan(scan_keys, mission, models, states, robot)
+    return act.scan(scan_keys, mission, models, states, robot), None
 
 
 @jax.named_scope("mission.drift")

@@ -32,37 +32,27 @@ def seen_by(own, other=(0, 0, 0)):
 
 
 @pytest.mark.parametrize(
-    ("values", "target"),
+    ("auctions", "values", "target"),
     [
-        ([1.0, 0.5, 0.0, 0.0], 0),  # the best
-        ([1.0, 0.95, 0.0, 0.0], 1),  # within .1 of the best, and nearer
-        ([1.0, 0.95, 1.0, 0.0], 1),
-        ([1.0, 0.85, 1.0, 0.0], 0),  # PoI 1 is too bad, PoI 2 too far
-        ([-0.2, 0.1, 0.3, 0.2], 2),  # nearer PoI 1 is within .2, not within .1
-    ],
-)
-def test_of_values_within_the_tolerance_the_nearest_is_taken(chosen, values, target):
-    state = chosen(values)
-    assert state.robots.target[0] == target
-    assert state.robots.phase[0] == DRIVING
-    # PoIs 0 and 1 are in view from where the robot stands: nothing to drive to.
-    assert state.robots.goals[0] == (target == 2)
-
-
-@pytest.mark.parametrize(
-    ("values", "target"),
-    [
+        (False, [1.0, 0.5, 0.0, 0.0], 0),  # the best
+        (False, [1.0, 0.95, 0.0, 0.0], 1),  # within .1 of the best, and nearer
+        (False, [1.0, 0.95, 1.0, 0.0], 1),
+        (False, [1.0, 0.85, 1.0, 0.0], 0),  # PoI 1 is too bad, PoI 2 too far
+        (False, [-0.2, 0.1, 0.3, 0.2], 2),  # nearer PoI 1 is within .2, not within .1
+        (False, [0.1, 0.2, 0.3, 0.3], 3),  # nothing beats NOP
         # PoI 0 is straight ahead, 0.04 m from where it is seen; PoI 1 is a quarter turn away.
-        ([0.1, 5.0, 0.2, 0.0], 0),
-        ([-0.1, 0.2, 5.0, 0.0], 1),
-        ([-0.1, -0.2, 5.0, 0.0], 2),
-        ([0.5, 0.5, 0.5, 0.6], 3),
+        (True, [0.1, 5.0, 0.2, 0.0], 0),
+        (True, [-0.1, 0.2, 5.0, 0.0], 1),
+        (True, [-0.1, -0.2, 5.0, 0.0], 2),
+        (True, [0.5, 0.5, 0.5, 0.6], 3),
     ],
 )
-def test_in_an_auction_a_robot_takes_what_is_near_of_all_that_pays(chosen, values, target):
-    state = chosen(values, auctions=True)
+def test_a_robot_takes_what_is_near_of_all_that_pays(chosen, auctions, values, target):
+    state = chosen(values, auctions=auctions)
     assert state.robots.target[0] == target
     assert state.robots.phase[0] == (ENDED if target == 3 else DRIVING)
+    # PoIs 0 and 1 are in view from where the robot stands: nothing to drive to.
+    assert state.robots.goals[0] == (target == 2)
 
 
 def test_in_an_auction_another_robot_takes_what_is_nearer_to_it(chosen, set_robot):
@@ -74,20 +64,9 @@ def test_in_an_auction_another_robot_takes_what_is_nearer_to_it(chosen, set_robo
     assert chosen([1.0, 1.0, 1.0, 0.0], change=done, auctions=True).robots.target[0] == 0
 
 
-def test_when_nothing_beats_nop_the_robot_ends(chosen):
-    state = chosen([0.1, 0.2, 0.3, 0.3])
-    assert state.robots.phase[0] == ENDED
-    assert state.robots.target[0] == 3
-    assert state.robots.goals[0] == 0
-
-
 @pytest.mark.parametrize("policy", [LATENT, NAIVE])
-def test_of_equal_values_the_nearest_is_taken(chosen, policy):
+def test_of_equal_values_the_nearest_that_nobody_heads_for_is_taken(chosen, set_robot, policy):
     assert chosen([1.0] * 3 + [0.0], policy).robots.target[0] == 1
-
-
-@pytest.mark.parametrize("policy", [LATENT, NAIVE])
-def test_of_equal_values_the_one_that_nobody_heads_for_is_taken(chosen, set_robot, policy):
     heading = lambda state: set_robot(state, 1, target=1)  # noqa: E731
     assert chosen([1.0] * 3 + [0.0], policy, heading).robots.target[0] == 0
 
