@@ -155,7 +155,9 @@ def write(file: Path, trees: Mapping[str, Any], config: Config, made: Origin) ->
     arrays = {name: np.asarray(leaf) for name, leaf in pretrained.flat(trees).items()}
     about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
     text = np.array(json.dumps(about, allow_nan=False))
-    np.savez_compressed(file, allow_pickle=False, **{**arrays, "about": text})
+    partial = file.with_suffix(".part.npz")  # a task's file is written once
+    np.savez_compressed(partial, allow_pickle=False, **{**arrays, "about": text})
+    partial.replace(file)
 
 
 def main(argv: list[str]) -> None:

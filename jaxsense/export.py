@@ -301,7 +301,7 @@ def _of_sensor(sensor: Sensor) -> dict[str, object]:
 
 
 class Arguments(Checked):
-    """Writes detectors, encoders and policies of a run into one file for robots without JAX.
+    """Writes detectors, fusion and policies of a run into one file for robots without JAX.
 
     Attributes:
       run: The directory of a finished run, e.g. `runs/20261123-190025-default`, or `latest` for the

@@ -1,5 +1,6 @@
 """Whole episodes of policies from random starts and every state of the map, and the optimum."""
 
+import dataclasses
 import itertools
 import math
 import random
@@ -90,8 +91,11 @@ def run_episode(
     def play(carry: _Carry) -> _Carry:
         state, looks = carry.state, carry.looks
         posterior = jax.nn.log_softmax(carry.log_likelihood)
-        times = mdp.travel.times(state.team)
-        known = Known(state.belief, looks, posterior, state.team, times, state.agent)
+        team = state.team
+        if mdp.is_single:  # starts may have been prepared with another sensor
+            team = dataclasses.replace(team, modality=jnp.asarray(mdp.robots, jnp.int32))
+        times = mdp.travel.times(team)
+        known = Known(state.belief, looks, posterior, team, times, state.agent)
         policy = jax.random.fold_in(policy_key, state.steps)
         action, memory = act(policy, known, carry.memory)
         if mdp.teams is None:

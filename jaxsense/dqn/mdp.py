@@ -111,6 +111,7 @@ class Mdp:
 
     def of(self, modality: Index) -> "Mdp":
         """The MDP in which the only robot has another sensor."""
+        checks.require_index("modality", modality, self.num_modalities)
         teams = self.teams and dataclasses.replace(self.teams, is_random=False)
         return dataclasses.replace(self, robots=(modality,), teams=teams)
 

@@ -148,7 +148,7 @@ class Robots:
 def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
     """Robots of a task; or of the MDP of teams, with the settings that name them."""
     played = mdp.mdp if isinstance(mdp, Task) else mdp
-    teams = played.teams
+    teams = getattr(played, "teams", None)
     if isinstance(mdp, Task) and teams and config is None:
         carried = tuple(mdp.modalities[int(m)] for m in played.robots)
         return Robots(played, mdp.scaling, names_of_robots(carried))
@@ -157,8 +157,9 @@ def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
         whole = dataclasses.replace(teams, is_random=False)
         played = dataclasses.replace(played, robots=robots, teams=whole)
         return Robots(played, None, config.robot_names)
-    expected = "must be a task of a team alone, or an Mdp of teams and the settings it is made with"
-    raise ValueError(f"mdp = {type(mdp).__name__}: {expected}")
+    given = type(mdp).__name__ if isinstance(mdp, Mdp) else repr(mdp)
+    task = "must be a task of a team alone, such as jaxsense.make('team-v0')"
+    raise ValueError(f"mdp = {given}: {task}, or an Mdp of teams and the settings it is made with")
 
 
 def spaces_of(spaces: Any, played: Environment | Robots) -> tuple[Any, Any]:

@@ -47,16 +47,17 @@ class TeamAECEnv(AECEnv):
         self.render_mode = None
         self.possible_agents = list(self._robots.names)
         self.agents = []
-        self._spaces = common.spaces_of(spaces, self._robots)
+        of_each = common.spaces_of(spaces, self._robots)
+        self._spaces = dict.fromkeys(self.possible_agents, of_each)
         self._key: Key | None = None
 
     def observation_space(self, agent: str) -> spaces.Space:
         """Space of a robot's observations, `[S]`."""
-        return self._spaces[0]
+        return self._spaces[agent][0]
 
     def action_space(self, agent: str) -> spaces.Space:
         """Space of a robot's actions: each PoI, and NOP."""
-        return self._spaces[1]
+        return self._spaces[agent][1]
 
     def reset(self, seed: int | None = None, options: dict[str, object] | None = None) -> None:
         """Starts an episode; no options are read."""

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.section import require_32_bits
+from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.mdp import Mdp, State
@@ -105,6 +106,9 @@ class Environment:
           The next state, and what the agent sees of it. The reward is that of the look, if there
           was one, less the price of the time of all robots. An episode that has ended goes on.
         """
+        checks.require_type("state", state, State, "as from reset")
+        checks.require_shape("action", action, ())
+        checks.require_index("action", action, self.num_actions)
         after, outcome = mdps.step(key, self.mdp, state, state.team.existing(action))
         seen, reward = self.observe(after), self.mdp.earned(outcome, after.team)
         return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)

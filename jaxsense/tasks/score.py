@@ -287,15 +287,30 @@ def _choose(
 ) -> tuple[Int[Array, ""], PyTree]:
     """Action and memory of a policy; raises `ValueError` unless the action is an integer."""
     try:
-        action, memory = act(key, memory, observation)
+        found = act(key, memory, observation)
     except _UNTRACEABLE as error:
         expected = "must be a function that JAX can trace; wrap others in tasks.on_host"
         raise ValueError(f"policy: {expected}") from error
-    found = jnp.asarray(action)
-    if found.shape or not jnp.issubdtype(found.dtype, jnp.integer):
-        form = f"{found.dtype}{[*found.shape]}"
+    if not isinstance(found, tuple | list) or len(found) != 2:
+        raise ValueError("policy: must return an action and a memory")
+    action, after = found
+    if not isinstance(action, _NUMBERS):
+        raise ValueError(f"policy: must return an integer of shape []; not {type(action).__name__}")
+    action = jnp.asarray(action)
+    if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
+        form = f"{action.dtype}{[*action.shape]}"
         raise ValueError(f"policy: must return an integer of shape []; not {form}")
-    return found.astype(jnp.int32), memory
+    if _form(after) != _form(memory):
+        raise ValueError(
+            "policy: must return a memory with the structure, shapes and dtypes of the first"
+        )
+    return action.astype(jnp.int32), after
+
+
+def _form(tree: PyTree) -> tuple[object, object]:
+    """Structure, shapes and dtypes of a tree."""
+    leaves = [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
+    return jax.tree.structure(tree), leaves
 
 
 def _forget(

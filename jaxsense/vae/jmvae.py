@@ -55,8 +55,10 @@ class Jmvae:
         if not self.modalities or len(encoders) < len(self.subsets):
             expected = "must be one name or more, none twice, and none with a +, which joins names"
             raise ValueError(f"modalities = {self.modalities}: {expected}")
-        for name in ("feature_sizes", "hidden", "latent_size", "max_subset"):
-            for size in jax.tree.leaves(getattr(self, name)):
+        most = () if self.max_subset is None else (self.max_subset,)
+        sizes = {"feature_sizes": self.feature_sizes, "hidden": self.hidden, "max_subset": most}
+        for name, numbers in {**sizes, "latent_size": (self.latent_size,)}.items():
+            for size in numbers:
                 checks.require_number(name, size)
 
     @property

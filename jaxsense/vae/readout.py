@@ -49,6 +49,7 @@ class Bayes:
         chex.assert_rank(features, 1)
         checks.require_probabilities("features", features)
         labels = self.labels[modality]
+        checks.require_index("labels", labels, len(features))
         prior = jnp.zeros(len(features)).at[labels].add(1 / len(labels))
         return jnp.log(jnp.maximum(features[labels], _MIN_FEATURE) / prior[labels])
 

@@ -15,6 +15,7 @@ from jaxsense import Belief, dqn, mission, recorded, sim, tasks, vae
 from jaxsense.dqn import replay
 from jaxsense.dqn.optimum import interpolate
 from jaxsense.dqn.rewards import information
+from jaxsense.interfaces import common as interfaces_common
 from jaxsense.mission import begin
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.sim.light import random_light
@@ -121,6 +122,36 @@ FUNCTIONS = {
         lambda w: jaxsense.score("map-v0", tasks.Recurrent(nop, 0)),
         "policy.act = nop: must be a function (key, memory, observation) -> (action, memory)",
     ),
+    "score returns nothing": (
+        lambda w: jaxsense.score("map-v0", lambda key, x: None),
+        "policy: must return an integer of shape []; not NoneType",
+    ),
+    "recurrent returns an action": (
+        lambda w: jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, x: 0, 0)),
+        "policy: must return an action and a memory",
+    ),
+    "recurrent memory grows": (
+        lambda w: jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, x: (0, (m, m)), 0)),
+        "policy: must return a memory with the structure, shapes and dtypes of the first",
+    ),
+    "task step bool": (lambda w: jaxsense.make("map-v0").step(w.key, w.state, True), "dtype bool"),
+    "task step observation": (
+        lambda w: jaxsense.make("map-v0").step(w.key, w.x, 0),
+        "must be State, as from reset",
+    ),
+    "mdp of": (
+        lambda w: w.mdp.of(7),
+        "modality = 7: must be a whole number from 0 to 1",
+    ),
+    "bayes label": (
+        lambda w: w.models.bayes.update(w.models.bayes.prior, np.ones(1, np.float32), 0),
+        "labels = 1: must be a whole number from 0 to 0",
+    ),
+    "team of a name": (
+        lambda w: interfaces_common.robots_of("team-v0"),
+        "mdp = 'team-v0': must be a task of a team alone, such as jaxsense.make('team-v0')",
+    ),
+    "Jmvae size": (lambda w: vae.Jmvae(("a",), (2,), None, (8,)), "latent_size = None"),
     "missions function": (
         lambda w: of_missions(w, policies=values),
         "policies = values: must be a dictionary from names to policies",
