@@ -49,11 +49,31 @@ Row = TypeVar("Row")
 Result = TypeVar("Result")
 
 
+@pytree
+class Course:
+    """Where a robot wants to move.
+
+    Attributes:
+      waypoint: where its path leads next, in metres.
+      bearing: of its target, see `viewpoints.bearing`.
+    """
+
+    phase: Int[Array, ""]
+    waypoint: Float[Array, "2"]
+    bearing: Float[Array, ""]
+    makes_room: Bool[Array, ""]
+
+
 @jax.named_scope("mission.approach")
-def approach(mission: Mission, models: Models, state: MissionState, robot: Index) -> MissionState:
+def approach(
+    mission: Mission, models: Models, state: MissionState, robot: Index
+) -> tuple[MissionState, Course]:
     """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
 
     A robot need not get to the viewpoint itself if a look from nearby is new.
+
+    Returns:
+      The next state, and where the robot wants to move, see `steer`.
     """
     me = Robot(mission, state, robot)
     own, poi, paths = me.own, me.target, state.roadmap
@@ -80,10 +100,11 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
     phase = jnp.select(
         [arrives, is_blocked, is_stuck, is_back], [FACING, IDLE, BACKING, IDLE], own.phase
     )
-    return state.with_robot(
+    makes_room = (phase == ENDED) & _is_in_the_way(me) & (time < state.faults.stops_at[robot])
+    course = Course(phase, waypoint, _bearing(me), makes_room)
+    after = state.with_robot(
         robot,
         phase=phase,
-        wanted=_steer(me, phase, waypoint),
         attempts=attempts,
         unreachable=own.unreachable | gives_up,
         goals=own.goals - is_blocked,
@@ -93,26 +114,24 @@ def approach(mission: Mission, models: Models, state: MissionState, robot: Index
         progress_at=jnp.where(progresses | arrives, time, own.progress_at),
         backs_off_until=jnp.where(is_stuck, time + RECOVERY_TIME, own.backs_off_until),
     )
+    return after, course
 
 
 @jax.named_scope("mission.steer")
-def _steer(me: Robot, phase: Int[Array, ""], waypoint: Float[Array, "2"]) -> Float[Array, "2"]:
+def steer(mission: Mission, state: MissionState, robot: Index, course: Course) -> Float[Array, "2"]:
     """Speeds that a robot wants: along its path, backing off, making room, or turning.
 
     It senses where obstacles are, but has to trust its own pose for where the waypoint is.
     """
-    state, scene, arena = me.state, me.state.scene, me.mission.config.arena
-    poses, commands = scene.poses, me.state.robots.command
-    makes_room = (phase == ENDED) & _is_in_the_way(me)
-    makes_room &= state.time < state.faults.stops_at[me.index]
-    backs_off = (phase == BACKING) | makes_room
-    aim = localisation.aimed_at(waypoint, poses[me.index], state.pose_error[me.index])
+    poses, commands = state.scene.poses, state.robots.command
+    arena, layout = mission.config.arena, state.scene.layout
+    backs_off = (course.phase == BACKING) | course.makes_room
+    aim = localisation.aimed_at(course.waypoint, poses[robot], state.pose_error[robot])
     drive = navigation.drive_to(
-        arena, scene.layout, poses, commands, me.index, aim, CONTROL_PERIOD, backs_off
+        arena, layout, poses, commands, robot, aim, CONTROL_PERIOD, backs_off
     )
-    turn = navigation.face(_bearing(me))
-    is_driving = (phase == DRIVING) | backs_off
-    return jnp.where(is_driving, drive, jnp.where(phase == FACING, turn, 0.0))
+    is_driving, turn = (course.phase == DRIVING) | backs_off, navigation.face(course.bearing)
+    return jnp.where(is_driving, drive, jnp.where(course.phase == FACING, turn, 0.0))
 
 
 def _bearing(me: Robot) -> Float[Array, ""]:

@@ -27,6 +27,7 @@ from jaxsense.sim.light import random_light
 from jaxsense.sim.world import Scene
 
 _NUM_CANDIDATES = 32  # positions drawn for each robot
+_CHECKED_AT_ONCE = 4  # of them, since one of the first has room nearly always
 
 
 @checks.typed
@@ -164,18 +165,27 @@ def _random_poses(
         to_pois = jnp.linalg.norm(layout.position - position[None], axis=-1)
         room = jnp.min(to_pois) - config.arena.poi_extent - PLANNING_RADIUS
         # A corner behind a PoI may have no way out.
-        lengths = paths.lengths(position)
-        has_paths = jnp.all(jnp.any(jnp.isfinite(lengths), axis=-1))
+        has_paths = jnp.all(paths.reaches(position, leads))
         return jnp.where(has_paths, room, room - config.arena.side)
 
     def place_robot(taken: jax.Array, robot: jax.Array) -> tuple[jax.Array, jax.Array]:
-        apart = jnp.linalg.norm(candidates[robot][:, None] - taken[None], axis=-1)
-        beside = jnp.min(apart, axis=-1) - 3 * PLANNING_RADIUS
-        free = jnp.minimum(room[robot], beside)
+        def check(found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            """How much room there is around the next candidates."""
+            first, free = found
+            some = jax.lax.dynamic_slice_in_dim(candidates[robot], first, _CHECKED_AT_ONCE)
+            apart = jnp.linalg.norm(some[:, None] - taken[None], axis=-1)
+            beside = jnp.min(apart, axis=-1) - 3 * PLANNING_RADIUS
+            room = jnp.minimum(jax.vmap(room_at)(some), beside)
+            free = jax.lax.dynamic_update_slice_in_dim(free, room, first, 0)
+            return first + _CHECKED_AT_ONCE, free
+
+        none_yet = lambda found: (found[0] < _NUM_CANDIDATES) & ~jnp.any(found[1] > 0)  # noqa: E731
+        unknown = jnp.full(_NUM_CANDIDATES, -jnp.inf)
+        _, free = jax.lax.while_loop(none_yet, check, (jnp.int32(0), unknown))
         chosen = jnp.where(jnp.any(free > 0), jnp.argmax(free > 0), jnp.argmax(free))
         position, yaw = candidates[robot, chosen], jnp.pi * draws[robot, 2, chosen]
         return taken.at[robot].set(position), jnp.append(position, yaw)
 
-    room = jax.vmap(jax.vmap(room_at))(candidates)
+    leads = paths.leads
     nowhere = jnp.full((num_robots, 2), jnp.inf)
     return jax.lax.scan(place_robot, nowhere, jnp.arange(num_robots))[1]

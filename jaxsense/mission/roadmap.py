@@ -74,6 +74,18 @@ class Roadmap:
         found = jnp.minimum(jnp.where(is_free, direct.reshape(is_free.shape), jnp.inf), around)
         return jnp.where(jnp.isposinf(found), jnp.inf, found)  # infinite without a gradient
 
+    @property
+    def leads(self) -> Bool[Array, "N K"]:
+        """From which nodes a path leads to a viewpoint of each PoI."""
+        is_last = jnp.any(jnp.isfinite(self.last()), axis=-2)
+        return jnp.any(jnp.isfinite(self.between)[None] & is_last[:, None], axis=-1)
+
+    def reaches(self, position: Float[Array, "2"], leads: Bool[Array, "N K"]) -> Bool[Array, " N"]:
+        """Which PoIs have a path to a viewpoint, from `leads`: cheaper than `lengths`."""
+        direct, to_node = self._first(position, self.viewpoints.reshape(-1, 2))
+        is_direct = ~jnp.isposinf(direct).reshape(self.is_free.shape) & self.is_free
+        return jnp.any(is_direct, axis=-1) | jnp.any(~jnp.isposinf(to_node)[None] & leads, axis=-1)
+
     def last(
         self, poi: Index | slice = slice(None), view: Index | slice = slice(None)
     ) -> Float[Array, "... K"]:

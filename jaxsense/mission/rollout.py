@@ -13,7 +13,7 @@ from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, pytree
 from jaxsense.mission import act, decide, navigation
-from jaxsense.mission.act import where_due
+from jaxsense.mission.act import Course, where_due
 from jaxsense.mission.state import (
     ENDED,
     FAILED,
@@ -87,7 +87,12 @@ def step(
     robot_keys, drift_keys, message_keys = step_keys[:-2], step_keys[-2], step_keys[-1]
     # One after the other, so that no robot scans what another has just identified.
     act_each = functools.partial(_act, mission, models)
-    states, _ = jax.lax.scan(act_each, states, (jnp.arange(num_robots), robot_keys))
+    all_robots = jnp.arange(num_robots)
+    states, courses = jax.lax.scan(act_each, states, (all_robots, robot_keys))
+    # All robots at once: nothing that they do here changes where the others are.
+    steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
+    wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
+    states = dataclasses.replace(states, robots=dataclasses.replace(states.robots, wanted=wanted))
     states = _drift(drift_keys, mission, before, move(mission, states))
     is_idle, steps = jnp.all(states.robots.phase >= ENDED, axis=-1), states.steps + 1
     is_late = steps * CONTROL_PERIOD >= mission.config.mission.time_limit
@@ -111,7 +116,7 @@ def step(
 
 def _act(
     mission: Mission, models: Models, states: MissionState, turn: tuple[Int[Array, ""], Key]
-) -> tuple[MissionState, None]:
+) -> tuple[MissionState, Course]:
     """Decides, drives and scans with one robot of each of B missions, whose turn it is."""
     robot, keys = turn
 
@@ -127,8 +132,8 @@ def _act(
     inputs = choice_keys, states
     robots = where_due(due, decided, states.robots, inputs, kinds=states.policy)
     states = dataclasses.replace(states, robots=robots)
-    states = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
-    return act.scan(scan_keys, mission, models, states, robot), None
+    states, course = jax.vmap(lambda state: act.approach(mission, models, state, robot))(states)
+    return act.scan(scan_keys, mission, models, states, robot), course
 
 
 @jax.named_scope("mission.drift")

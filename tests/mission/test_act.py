@@ -167,7 +167,11 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
 
 @pytest.fixture(scope="module")
 def approach(team, models):
-    return jax.jit(lambda state, robot: act.approach(team, models, state, robot))
+    def approach(state, robot):
+        after, course = act.approach(team, models, state, robot)
+        return after.with_robot(robot, wanted=act.steer(team, after, robot, course))
+
+    return jax.jit(approach)
 
 
 def driving(state, set_robot, view, seconds, progress_at, path_left=0.1):

@@ -78,7 +78,7 @@ def searching(search):
 
 
 def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):
-    approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA))
+    approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA)[0])
     viewpoint = facing(CAMERA, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).roadmap.viewpoints[0, 0]
     there, short = [*viewpoint, 0.0], [viewpoint[0] + 0.25, viewpoint[1], 0.0]
     for pose, error, phase in (

@@ -109,6 +109,6 @@ def test_near_a_viewpoint_a_robot_stops_only_where_a_look_is_new(
     state = arena_of(POSITIONS, [[*place, 0.0], [-1.2, 0.2, 0.0]])
     state = looked_from(place)(state) if looked else state
     under_way = set_robot(state, 0, phase=DRIVING, target=0, view=view, path_left=0.2)
-    approach = jax.jit(lambda models, state: act.approach(team, models, state, 0))
+    approach = jax.jit(lambda models, state: act.approach(team, models, state, 0)[0])
     after = approach(replace(models, novelty=learned), under_way)
     assert after.robots.phase[0] == phase
