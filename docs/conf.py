@@ -38,7 +38,7 @@ nitpicky = True
 # Type variables have no page.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!jaxsense).*"),
-    ("py:(class|obj)", r".*\.([BDEMST](_co)?|Row|Result|Annotated)"),
+    ("py:(class|obj)", r".*\.([BDEMRST](_co)?|Row|Result|Annotated)"),
 ]
 
 myst_enable_extensions = ["amsmath", "colon_fence", "dollarmath"]

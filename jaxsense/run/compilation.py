@@ -297,9 +297,9 @@ class Program:
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
         """Runs the program, and returns before its results are ready."""
         compiled = self.wait()
-        # JAX itself places what one process runs, and in missions most of it lies there already.
-        if self._places is not None and jax.process_count() > 1:
-            args = tuple(map(devices.put, args, self._places))
+        if self._places is not None:
+            put = devices.put if jax.process_count() > 1 else jax.device_put
+            args = tuple(map(put, args, self._places))
         return compiled(*args)
 
     def __call__(self, *args: PyTree) -> PyTree[jax.Array]:

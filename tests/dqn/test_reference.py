@@ -28,7 +28,7 @@ def chosen(rewards, seen, classes=(0, 1, 2), labels=LABELS):
 
 def test_expected_rewards_average_over_the_draws():
     mdp = noisy_mdp()  # every look gains a uniform number of its own
-    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp, 0, num_draws=400))()
+    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp.of(0), num_draws=400))()
     # 1/2 +- 4 sqrt(1/12 / 400) = +- .058, by different draws for each number.
     np.testing.assert_allclose(rewards, 0.5, atol=0.058)
     assert len(np.unique(rewards)) == 12
@@ -52,7 +52,7 @@ def test_rewards_are_averaged_over_the_classes_that_looks_leave_open(rewards_of_
 
 def test_rewards_of_one_poi_and_three_modalities():
     mdp = classes_mdp(num_pois=1, num_modalities=3)
-    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp, 1, num_draws=2))()
+    rewards = jax.jit(lambda: episodes.expected_rewards(KEY, mdp.of(1), num_draws=2))()
     # By who has looked, first modality in the lowest bit: nobody .2 - .158114, one other 1 - .2,
     # both others 2 - 1, and in vain where the own bit is set.
     of_codes = [0.041886, 0.8, -1.0, -1.0, 0.8, 1.0, -1.0, -1.0]

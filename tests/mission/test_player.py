@@ -178,7 +178,7 @@ def test_missions_with_physics_do_not_depend_on_how_many_play_at_once(team, mode
     def play(batch, split="one device"):
         monkeypatch.setattr(missions, "batch_of", lambda *_: batch)
         with Compiler(Monitor()) as compiler:
-            player = missions.Player(short, compiler, batch, WORKERS[split]())
+            player = missions.Player(short, compiler, batch, WORKERS[split](), models)
             return player.play(KEY, models, cases, episodes=32)
 
     many = play(64)
