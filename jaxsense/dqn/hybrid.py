@@ -65,7 +65,7 @@ def worth(agent: Agent, params: Params, classes: Belief, known: Known) -> Float[
     it. Who looks is for others to say: the network would leave a PoI to a robot that is nearer.
     """
     belief, team, robot = known.belief, known.team, known.robot
-    num_pois = len(team.present)
+    num_pois = team.present.shape[0]  # not `len`: exported programs have any number
     if agent.travel is None:
 
         def of_poi(poi: Int[Array, ""]) -> jax.Array:

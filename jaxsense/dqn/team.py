@@ -58,7 +58,7 @@ class Team:
         Args:
           action: `[]` int32; returned as it is if there is no such action.
         """
-        nop = len(self.present)
+        nop = self.present.shape[0]
         is_absent = jnp.any(~self.present & (jnp.arange(nop) == action))
         return jnp.where(is_absent, nop, action)
 
