@@ -31,7 +31,7 @@ from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team import Team
 from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps
-from jaxsense.mission.decide import ask, choose, times_to_new_looks
+from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
 from jaxsense.models import Models, make_agent, make_jmvae, make_travel
 from jaxsense.run import cli, devices, files, output, rundir
@@ -86,7 +86,7 @@ _MEANING = {
     "works": "robots that have neither ended by NOP nor failed",
     "target": "PoI that each robot heads for, N for none",
     "action": "PoI to look at next; N for NOP, the robot's end; -1 if a value is not a number",
-    "values": "the policy's value of each action, NOP's last; the rules choose among the best",
+    "values": "the policy's value of each action, NOP's last; the highest is taken",
 }
 """Of inputs and outputs."""
 
@@ -195,21 +195,21 @@ def _decide(config: Config) -> Function:
         robot: jax.Array,
         *of_team: jax.Array,
     ) -> Arrays:
-        """The robot's choice, by its policy and the rules of missions."""
+        """The robot's choice: the action of the highest value."""
         team = Team(*of_team)
         ways = team.poses[:, None, None, :2] - jnp.swapaxes(looked_from, 0, 1)[team.modality]
-        apart = jnp.linalg.norm(ways, axis=-1)
+        to_go = jax.vmap(models.novelty.to_go)(jnp.linalg.norm(ways, axis=-1), team.modality)
         known = Known(
             belief=Belief(mean, std),
             # The policy of a run reads neither.
             looks=jnp.zeros((mean.shape[0], modalities), jnp.int32),
             log_posterior=jnp.zeros((mean.shape[0], classes)),
             team=team,
-            times=times_to_new_looks(make_travel(config), models.novelty, team, apart),
+            times=make_travel(config).times(team, to_go),
             robot=robot,
         )
-        opinion = ask(key, POLICIES["latent"], models, known)
-        return {"action": choose(config.mission, opinion, known), "values": opinion.values}
+        values = POLICIES["latent"](key, models, known)
+        return {"action": action_of(values, known), "values": values}
 
     pois = config.arena.num_pois
     pois = _POIS if make_agent(config).plays(pois + 1) else pois

@@ -118,7 +118,13 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
         config=dataclasses.replace(config.mdp, max_steps=_MOST_CHOICES),
         num_pois=settings.num_pois[1],
         robots=jnp.repeat(jnp.arange(len(config.modalities)), _ROBOTS_EACH),
-        teams=Teams(settings, make_travel(config), places, config.modalities),
+        teams=Teams(
+            settings,
+            make_travel(config),
+            places,
+            config.modalities,
+            novelty=models.novelty if config.detector.num_repeats else None,
+        ),
     )
 
 

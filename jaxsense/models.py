@@ -48,7 +48,6 @@ class Models:
       agent: how the Q-networks are used.
       q_networks: for each modality, parameters of the Q-network; once trained, the same for all in
         a team.
-      tours: parameters of the network that orders looks, if any does, see `dqn.tours`.
     """
 
     detectors: tuple[Detector, ...]
@@ -60,7 +59,6 @@ class Models:
     look_values: tuple[LookValues, ...]
     agent: Agent
     q_networks: tuple[Params, ...]
-    tours: tuple[Params, ...]
 
     def detect(
         self,
@@ -193,12 +191,11 @@ def make_models(config: Config, **trained: Any) -> Models:
 
 
 def make_agent(config: Config) -> Agent:
-    """Agent of `config.dqn.task`; a team's reads the reward of a useless look from the settings."""
+    """Agent of `config.dqn.task`."""
     dqn, is_team = config.dqn, config.dqn.task == "team"
     return Agent(
         discount=dqn.discount,
         second_cost=config.team.second_cost,
-        useless=rewards.make(config.mdp).of_gain(jnp.float32(0)) if is_team else 0.0,
         travel=make_travel(config) if is_team else None,
         num_pois=config.team.num_pois[1] if is_team else config.arena.num_pois,
         num_modalities=len(config.modalities),
@@ -210,11 +207,6 @@ def make_agent(config: Config) -> Agent:
 def make_travel(config: Config) -> Travel:
     """How robots travel, according to the team's settings."""
     return Travel(config.team.travel.view_distance)
-
-
-def orders_looks(config: Config) -> bool:
-    """Whether a network learns in which order to look, see `dqn.tours`."""
-    return config.dqn.task == "team" and config.team.tours.steps > 0
 
 
 def make_readout(config: Config, classes: Belief) -> Readout:
@@ -276,7 +268,7 @@ def make_encoder(
 @checks.typed
 def init(key: Key, config: Config) -> Models:
     """Untrained models, to try functions before training."""
-    detector_key, jmvae_key, dqn_key, filter_key, tours_key = jax.random.split(key, 5)
+    detector_key, jmvae_key, dqn_key, filter_key = jax.random.split(key, 4)
     model, agent = make_jmvae(config), make_agent(config)
     dqn_keys = jax.random.split(dqn_key, len(config.modalities))
     shape = len(config.arena.classes), model.latent_size
@@ -311,7 +303,6 @@ def init(key: Key, config: Config) -> Models:
         novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         q_networks=tuple(agent.init(k) for k in dqn_keys),
-        tours=(agent.init(tours_key),) if orders_looks(config) else (),
     )
 
 

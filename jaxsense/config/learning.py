@@ -162,39 +162,19 @@ class TravelConfig(Section, place="team.travel"):
     view_distance: Traced[float] = limited(0.96, at_least=0)
 
 
-class ToursConfig(Section, place="team.tours"):
-    """Training of the network that orders a team's visits, see `jaxsense.dqn.tours`.
-
-    Attributes:
-      states: Number of states in which choices are tried, rounded up to whole chunks.
-      steps: Gradient steps. With 0, no order is learned, and an auction orders the looks that pay,
-        as with `dqn.task` = `map`.
-    """
-
-    states: int = limited(65536, at_least=1)
-    steps: int = limited(3200, at_least=0)
-
-    @property
-    def learning_rate(self) -> float:
-        """Initial learning rate of Adam; decays to zero along a cosine."""
-        return 2e-3
-
-
 class TeamConfig(Section, place="team"):
-    """The MDP of a team (`dqn.task` = team), in which robots have positions and looks take time.
+    """The MDP with travel (`dqn.task` = team), in which robots have positions and looks take time.
 
     Attributes:
       travel: Model of the time that a robot takes to look at a PoI.
-      tours: Training of the network that orders a team's visits.
       num_pois: Minimum and maximum number of PoIs in an episode.
       sides: Shortest and longest side of an episode's arena, in metres.
       second_cost: Cost of each second in which a robot works, in units of the reward.
     """
 
     travel: TravelConfig = TravelConfig()
-    tours: ToursConfig = ToursConfig()
-    num_pois: tuple[int, int] = limited((3, 8), at_least=1, at_most=64)
-    sides: Traced[tuple[float, float]] = limited((3.0, 6.0), above=0, at_most=100)
+    num_pois: tuple[int, int] = limited((2, 4), at_least=1, at_most=64)
+    sides: Traced[tuple[float, float]] = limited((3.0, 4.0), above=0, at_most=100)
     second_cost: Traced[float] = limited(0.0, at_least=0)
 
     def check(self) -> None:
@@ -230,19 +210,19 @@ class DqnConfig(Section, place="dqn"):
       target_period: Epochs between updates of the target network.
     """
 
-    task: Literal["map", "team"] = "map"
-    observe: Literal["live", "bank"] = "live"
-    hidden: tuple[int, ...] = limited((24, 24), at_least=1, at_most=_MAX_UNITS, min_items=1)
+    task: Literal["map", "team"] = "team"
+    observe: Literal["live", "bank"] = "bank"
+    hidden: tuple[int, ...] = limited((32, 32), at_least=1, at_most=_MAX_UNITS, min_items=1)
     num_envs: int = limited(512, at_least=1)
-    epochs: int = limited(200, at_least=1)
-    updates: int = limited(64, at_least=1)
+    epochs: int = limited(300, at_least=1)
+    updates: int = limited(16, at_least=1)
     batch: int = limited(512, at_least=1)
-    replay_capacity: int = limited(512000, at_least=1)
-    discount: Traced[float] = limited(0.5, at_least=0, at_most=1)
+    replay_capacity: int = limited(131072, at_least=1)
+    discount: Traced[float] = limited(0.2, at_least=0, at_most=1)
     learning_rate: Traced[float] = limited(1e-3, above=0, at_most=1)
-    epsilon_min: Traced[float] = limited(0.01, at_least=0, at_most=1)
+    epsilon_min: Traced[float] = limited(0.05, at_least=0, at_most=1)
     epsilon_decay: Traced[float] = limited(0.99, above=0, at_most=1)
-    target_period: Traced[int] = limited(50, at_least=1)
+    target_period: Traced[int] = limited(5, at_least=1)
 
     def check(self) -> None:
         """Checks that chunks are long and all environments fill the replay together."""

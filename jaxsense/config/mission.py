@@ -103,16 +103,11 @@ class MissionConfig(Section, place="mission"):
     """Missions, in which all robots act in closed loop in one arena.
 
     Attributes:
-      policies: Policies that play missions at the end of a run: any of `latent`, `network`,
+      policies: Policies that play missions at the end of a run: any of `latent`,
         `greedy`, `bayes`, `optimal`, `naive`, `naive_2`, `naive_3`, `random`, `nearest`, `auction`,
         `rollout` and custom policies. `jaxsense.evaluate` plays all of them.
       episodes: Missions per policy at the end of a run.
       time_limit: Maximum length of a mission, in seconds.
-      auctions: Whether robots divide the PoIs that are worth a look among themselves by an auction,
-        in which they bid travel times, if their policy prescribes no order. Otherwise, they follow
-        values.
-      equal_values: Tolerance, in units of the reward: actions whose values are this close to the
-        best count as equally good: a robot prefers PoIs that no other heads for, then the nearest.
       least_confidence: Minimum probability of the most likely label for a scan to update the map.
       localisation: Localisation errors.
       communication: Messages between robots about their looks.
@@ -121,8 +116,6 @@ class MissionConfig(Section, place="mission"):
     policies: tuple[str, ...] = limited(("latent", "naive", "random"), min_items=1)
     episodes: int = limited(128, at_least=1, at_most=MAX_EPISODES)
     time_limit: Traced[float] = limited(120.0, at_least=CONTROL_PERIOD, at_most=3600)
-    auctions: Traced[bool] = True
-    equal_values: Traced[float] = limited(0.1, at_least=0)
     least_confidence: Traced[float] = limited(0.98, at_least=0, below=1)
     localisation: LocalisationConfig = LocalisationConfig()
     communication: CommunicationConfig = CommunicationConfig()

@@ -42,6 +42,8 @@ def made(kind: Any, stored: object, base: object = None, place: str = "") -> obj
         plain = [*value] if isinstance(value, tuple) else value  # as JSON has it
         if plain in FORMER.get(path, ()):
             former[name] = plain
+        elif name not in kinds and isinstance(plain, dict):  # a former section
+            made(_Nothing, plain, None, path)
         elif name not in kinds:
             raise ConfigError(path, value, _unknown(path))
         else:
@@ -55,6 +57,11 @@ def made(kind: Any, stored: object, base: object = None, place: str = "") -> obj
         if field.name not in given and field.default is dataclasses.MISSING:
             raise ConfigError(place, stored, f"missing setting {field.name}")
     return kind(**given)  # pyright: ignore[reportCallIssue]
+
+
+@dataclasses.dataclass
+class _Nothing:
+    """A section without settings."""
 
 
 def _unknown(path: str) -> str:
@@ -130,6 +137,8 @@ FORMER: Mapping[str, Sequence[object]] = {
     "team.travel.speed": [0.2],
     "team.travel.turn_rate": [1.2],
     "team.travel.look_seconds": [0.7],
+    "team.tours.states": [65536, 512],
+    "team.tours.steps": [3200, 60, 0],
     "team.tours.tries": [4],
     "team.tours.walk": [8],
     "team.tours.batch": [1024, 64],
@@ -148,6 +157,8 @@ FORMER: Mapping[str, Sequence[object]] = {
     "navigation.inflation": [0.1],
     "navigation.view_distances": [[0.5, 0.9]],
     "mission.control_period": [0.1],
+    "mission.auctions": [True, False],
+    "mission.equal_values": [0.1, 0.05],
     "mission.nearest_first": [True],
     "mission.redecides": [True],
     "mission.avoids_targets": [True],

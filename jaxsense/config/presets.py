@@ -10,7 +10,6 @@ from jaxsense.config.learning import (
     JmvaeConfig,
     MdpConfig,
     TeamConfig,
-    ToursConfig,
     TravelConfig,
 )
 from jaxsense.config.mission import MissionConfig, NavigationConfig
@@ -36,28 +35,28 @@ _PAPER = Config(
     ),
     mdp=MdpConfig(min_increase=0.01, partly_seen_starts=True),
     dqn=DqnConfig(
-        observe="bank",
+        task="map",
+        hidden=(24, 24),
         discount=0.95,
         epochs=2000,
         updates=32,
-        batch=512,
         replay_capacity=1024000,
+        epsilon_min=0.01,
         target_period=100,
     ),
-    mission=MissionConfig(auctions=False),
 )
 
 _SMOKE = Config(
     detector=DetectorConfig(num_scans=3072, num_held_out=1536, steps=300, batch=128),
     jmvae=JmvaeConfig(restarts=1, samples_per_class=512, steps=300, batch=128),
     dqn=DqnConfig(
-        observe="bank",
+        hidden=(24, 24),
         num_envs=32,
         epochs=60,
+        updates=64,
         batch=64,
         replay_capacity=2048,
     ),
-    team=TeamConfig(tours=ToursConfig(states=512, steps=60)),
     evaluation=EvaluationConfig(
         num_starts=32,
         num_repeats=1,
@@ -95,7 +94,7 @@ _NOISY = Config(
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
-    dqn=DqnConfig(observe="bank", epochs=800, discount=0.2),
+    dqn=DqnConfig(hidden=(64, 64), epochs=1200),
     team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_looks=128),
     navigation=NavigationConfig(view_range=4.0),
@@ -106,7 +105,6 @@ _NOISY = Config(
         ),
         episodes=64,
         least_confidence=0.0,
-        equal_values=0.05,
     ),
 )
 
@@ -125,22 +123,12 @@ _RAW = Config(
         steps=4000,
         batch=128,
     ),
-    dqn=DqnConfig(epochs=800),
 )
 
 _TEAM = Config(
     arena=ArenaConfig(side=4.0, num_pois=8),
-    dqn=DqnConfig(
-        task="team",
-        observe="bank",
-        hidden=(32, 32),
-        epochs=600,
-        updates=16,
-        replay_capacity=131072,
-        discount=0.2,
-        epsilon_min=0.05,
-        target_period=5,
-    ),
+    dqn=DqnConfig(hidden=(64, 64), epochs=1200),
+    team=TeamConfig(num_pois=(3, 8), sides=(3.0, 6.0)),
     evaluation=EvaluationConfig(num_pois=(3, 8, 20)),
     mission=MissionConfig(
         policies=("latent", "nearest", "auction", "rollout", "naive", "random"), time_limit=300.0
@@ -167,9 +155,8 @@ _MANY = dataclasses.replace(
     ),
     jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
     mdp=MdpConfig(reward="nats", look_cost=0.05),
-    dqn=dataclasses.replace(_TEAM.dqn, hidden=(64, 64), updates=32),
-    # Learned orders do not know that a robot which looks again drives to another place.
-    team=dataclasses.replace(_NOISY.team, tours=ToursConfig(steps=0)),
+    dqn=DqnConfig(hidden=(64, 64), epochs=1200, updates=32),
+    team=dataclasses.replace(_NOISY.team, num_pois=(3, 8)),
     evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),
     mission=dataclasses.replace(
         _NOISY.mission,

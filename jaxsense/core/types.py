@@ -165,6 +165,18 @@ class Fusion(Protocol):
         ...
 
 
+class Novelty(Protocol):
+    """Protocol of how new a look is after earlier ones from nearby; see `vae.Novelty`."""
+
+    def weight(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
+        """Share of a look that is new evidence, by the distances of earlier looks in metres."""
+        ...
+
+    def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
+        """Metres to where a look is new enough."""
+        ...
+
+
 @pytree
 class Transition:
     """One transition of an MDP, or a batch of them, from which a Q-network learns.

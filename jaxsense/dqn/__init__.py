@@ -12,7 +12,6 @@ from jaxsense.dqn.mdp import step as step
 from jaxsense.dqn.optimum import value_iteration as value_iteration
 from jaxsense.dqn.policies import POLICIES as POLICIES
 from jaxsense.dqn.policies import Known as Known
-from jaxsense.dqn.policies import Policy as Policy
 from jaxsense.dqn.rewards import Nats as Nats
 from jaxsense.dqn.rewards import Paper as Paper
 from jaxsense.dqn.rewards import Reward as Reward

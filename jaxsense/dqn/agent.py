@@ -25,13 +25,11 @@ class Agent:
     Attributes:
       discount: `[]` discount factor of a step; with travel, of a second.
       second_cost: `[]` price of a second of travel.
-      useless: `[]` reward of a look that tells nothing.
       num_pois: number of PoIs; with travel, the largest that it learns with.
     """
 
     discount: jax.Array | float
     second_cost: jax.Array | float
-    useless: jax.Array | float
     travel: Travel | None
     num_pois: int = struct.field(pytree_node=False)
     num_modalities: int = struct.field(pytree_node=False)
@@ -54,28 +52,17 @@ class Agent:
         size = 2 * self.latent_size if self.travel is None else self.network.features
         return networks.init(key, self.network, size * self.num_pois)
 
-    def observe(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, " S"]:
+    def observe(
+        self, belief: Belief, team: Team, times: Float[Array, "R N"], robot: Int[Array, ""]
+    ) -> Float[Array, " S"]:
         """Input of the Q-network: `observation`, or `[F * N]` of `surroundings`."""
         if self.travel is None:
             return observation(belief)
-        return surroundings(self.travel, belief, team, robot, self.num_modalities).reshape(-1)
+        return surroundings(belief, team, times, robot, self.num_modalities).reshape(-1)
 
-    def q(
-        self,
-        params: Params,
-        observed: Float[Array, "S ..."],
-        others: Float[Array, "S ..."] | None = None,
-    ) -> Float[Array, "A ..."]:
-        """Values of looks, once the robot has arrived; NOP's last.
-
-        Args:
-          params: of the Q-network.
-          observed: what the robot knows.
-          others: with travel, what each PoI's value takes the other PoIs to be; as observed by
-            default.
-        """
-        inputs = (observed,) if others is None else (observed, others)
-        return networks.apply(self.network, params, *inputs)
+    def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """Values of looks, once the robot has arrived; NOP's last."""
+        return networks.apply(self.network, params, observed)
 
     def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
         """Values of actions as the robot sets out.
@@ -86,19 +73,11 @@ class Agent:
         after = self.q(params, observed)
         if self.travel is None:
             return after
-        of_pois = self.discount ** self.seconds(observed) * after[:-1]
-        return jnp.concatenate([self.less_way(of_pois, observed), after[-1:]])
-
-    def seconds(self, observed: Float[Array, "S ..."]) -> Float[Array, "N ..."]:
-        """The robot's own time to look at each PoI, from what it observes; with travel."""
         features = num_features(self.latent_size, self.num_modalities)
-        return own_seconds(observed.reshape(features, -1, *observed.shape[1:]), self.latent_size)
-
-    def less_way(
-        self, after: Float[Array, "N ..."], observed: Float[Array, "S ..."]
-    ) -> Float[Array, "N ..."]:
-        """Values on arrival less the price of the way there; with travel."""
-        return after - self.second_cost * self.seconds(observed)
+        known = observed.reshape(features, -1, *observed.shape[1:])
+        seconds = own_seconds(known, self.latent_size)
+        of_pois = self.discount**seconds * after[:-1] - self.second_cost * seconds
+        return jnp.concatenate([of_pois, after[-1:]])
 
 
 @checks.typed
@@ -174,4 +153,5 @@ class Environment:
         return Underway(now, seen, chosen), transition, outcome
 
     def _observe(self, state: State) -> jax.Array:
-        return self.agent.observe(state.belief, state.team, state.agent)
+        times = self.mdp.times(state)
+        return self.agent.observe(state.belief, state.team, times, state.agent)

@@ -94,7 +94,7 @@ def run_episode(
         team = state.team
         if mdp.is_single:  # starts may have been prepared with another sensor
             team = dataclasses.replace(team, modality=jnp.asarray(mdp.robots, jnp.int32))
-        times = mdp.travel.times(team)
+        times = mdp.times(dataclasses.replace(state, team=team))
         known = Known(state.belief, looks, posterior, team, times, state.agent)
         policy = jax.random.fold_in(policy_key, state.steps)
         action, memory = act(policy, known, carry.memory)
@@ -199,7 +199,7 @@ def reference(key: Key, mdp: Mdp, models: Trained, labels: Int[Array, "M C"]) ->
       labels: the label of each class in each modality.
     """
     if mdp.fusion.accumulates:
-        return lambda known, classes: policies.optimal(key, models, known)
+        return lambda known, classes: policies.UNORDERED["optimal"](key, models, known)
     rewards = expected_rewards(key, mdp)
     return lambda known, classes: _informed(rewards, labels, known.looks > 0, classes)
 

@@ -22,9 +22,12 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
+from jaxsense.core.types import Belief, Fusion, Index, Key, Novelty, Scene, call, pytree
 from jaxsense.dqn.rewards import Reward
 from jaxsense.dqn.team import Steps, Team, Teams, Travel, alone, num_features, surroundings
+
+_RECENT = 4  # looks by a sensor at a PoI whose places are remembered
+_NEVER = 1e6  # m, a place far from everything, where no look has been
 
 
 class Looks(Protocol):
@@ -119,21 +122,40 @@ class Mdp:
         """`[]` information of a `[D]` belief, in units of the reward."""
         return self.reward.information(belief, self.fusion.class_probabilities(belief))
 
-    def features(self, belief: Belief, team: Team, robot: Int[Array, ""]) -> Float[Array, "N F"]:
+    def features(
+        self, belief: Belief, team: Team, times: Float[Array, "R N"], robot: Int[Array, ""]
+    ) -> Float[Array, "N F"]:
         """What a robot knows of each PoI: its belief; of a team see `surroundings`."""
         if self.teams is None:
             return jnp.concatenate([belief.mean, belief.std], axis=-1)
-        return surroundings(self.teams.travel, belief, team, robot, self.num_modalities).T
+        return surroundings(belief, team, times, robot, self.num_modalities).T
+
+    def times(self, state: "State") -> Float[Array, "R N"]:
+        """Seconds until each robot has looked at each PoI from where a look is new."""
+        return self.travel.times(state.team, self.to_go(state))
+
+    def to_go(self, state: "State") -> Float[Array, "R N"]:
+        """Metres from each robot to where its look at each PoI is new."""
+        team, novelty = state.team, self.novelty
+        if novelty is None or (places := state.looked_from) is None:
+            return jnp.zeros(team.heads.shape)
+        of_robot = lambda pose, m: novelty.to_go(_apart(pose, places[:, m]), m)  # noqa: E731
+        return jax.vmap(of_robot)(team.poses, team.modality)
 
     @property
-    def second_cost(self) -> jax.Array | float:
-        """Price of a second of each robot that works."""
-        return 0.0 if self.teams is None else self.teams.config.second_cost
+    def novelty(self) -> Novelty | None:
+        """How new looks are; None where all are."""
+        return None if self.teams is None else self.teams.novelty
 
     def earned(self, outcome: "Outcome", team: Team) -> Float[Array, ""]:
         """The reward, less the price of time of all robots that then work."""
         number = jnp.sum(team.works, dtype=outcome.seconds.dtype)
         return outcome.reward - self.second_cost * outcome.seconds * number
+
+    @property
+    def second_cost(self) -> jax.Array | float:
+        """Price of a second of each robot that works."""
+        return 0.0 if self.teams is None else self.teams.config.second_cost
 
 
 @pytree
@@ -148,6 +170,8 @@ class State:
       asks: `[R]` bool, robots that have yet to choose at this moment; at first all that work.
       agent: `[]` int32 the robot that chooses.
       looked: `[R]` seconds that each robot has been looking.
+      looked_from: `[N, M, K, 2]` places of each modality's last looks at each PoI, in metres;
+        far away for none; None where all looks are new.
       seconds: `[]` since the start; without travel, looks.
     """
 
@@ -160,6 +184,7 @@ class State:
     asks: jax.Array
     agent: jax.Array
     looked: jax.Array
+    looked_from: jax.Array | None
     seconds: jax.Array
 
 
@@ -287,6 +312,7 @@ def begin(
         asks=team.works,
         agent=jnp.argmax(team.works).astype(jnp.int32),
         looked=jnp.zeros(len(team.works)),
+        looked_from=None if mdp.novelty is None else jnp.full((*seen.shape, _RECENT, 2), _NEVER),
         seconds=jnp.float32(0.0),
     )
 
@@ -316,7 +342,8 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     passes = ~jnp.any(asks) & ~terminated
 
     goals = team.positions.at[target].get(mode="clip")
-    times = jax.vmap(mdp.travel.seconds)(team.poses, goals)
+    to_go = mdp.to_go(state).at[robots, target].get(mode="clip")
+    times = jax.vmap(mdp.travel.seconds)(team.poses, goals, to_go)
     left = times - state.looked
     looker = jnp.argmin(jnp.where(works, left, jnp.inf)).astype(jnp.int32)
     is_looker = robots == looker
@@ -324,9 +351,9 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     # A look under way continues while another robot looks.
     looked = jnp.maximum(state.looked + seconds - (times - mdp.travel.look_seconds), 0.0)
     looked = jnp.where(is_looker, 0.0, jnp.minimum(looked, mdp.travel.look_seconds))
-    moved = jax.vmap(lambda pose, goal: mdp.travel.move(pose, goal, seconds))(team.poses, goals)
+    moved = jax.vmap(mdp.travel.move, (0, 0, 0, None))(team.poses, goals, to_go, seconds)
     poi = jnp.where(passes, target[looker], nop)
-    changed, reward = _look(key, mdp, state, poi, looker)
+    changed, reward = _look(key, mdp, state, poi, looker, moved[looker])
 
     following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
     after = dataclasses.replace(
@@ -349,17 +376,27 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
 
 
 def _look(
-    key: Key, mdp: Mdp, state: State, poi: Int[Array, ""], looker: Int[Array, ""]
+    key: Key,
+    mdp: Mdp,
+    state: State,
+    poi: Int[Array, ""],
+    looker: Int[Array, ""],
+    pose: Float[Array, "3"],
 ) -> tuple[dict[str, PyTree], Float[Array, ""]]:
     """What a robot's look changes, or NOP, and the `[]` reward."""
     is_nop, place = poi == mdp.num_pois, jnp.minimum(poi, mdp.num_pois - 1)
     old = jax.tree.map(lambda x: x[place], state.belief)
+    modality, weight, looked_from = mdp.sensor(state.team, looker), 1.0, state.looked_from
+    if mdp.novelty is not None and looked_from is not None:
+        earlier = looked_from[place, modality]
+        weight = mdp.novelty.weight(_apart(pose, earlier), modality)
+        latest = jnp.concatenate([pose[None, :2], earlier[:-1]])
+        looked_from = looked_from.at[place, modality].set(latest)
 
     def look(modality: int) -> tuple[Belief, Scene]:
         features, scene = mdp.looks.observe(key, state.scene, place, modality)
-        return mdp.fusion.update(old, state.seen[place], features, modality), scene
+        return mdp.fusion.update(old, state.seen[place], features, modality, weight), scene
 
-    modality = mdp.sensor(state.team, looker)
     if mdp.is_single:
         new, scene = call(look, modality, mdp.num_modalities)
     else:
@@ -375,10 +412,16 @@ def _look(
         "belief": jax.tree.map(lambda x, y: x.at[place].set(y), state.belief, new),
         "seen": state.seen.at[place, modality].set(True),
         "scene": scene,
+        "looked_from": looked_from,
     }
     before = {name: getattr(state, name) for name in looked}
     changed = jax.tree.map(functools.partial(jnp.where, is_nop), before, looked)
     return changed, jnp.where(exists, jnp.where(is_nop, 0.0, of_look), jnp.nan)
+
+
+def _apart(pose: Float[Array, "3"], places: Float[Array, "*S 2"]) -> Float[Array, "*S"]:
+    """Distances of a robot from places, in metres."""
+    return jnp.linalg.norm(places - pose[:2], axis=-1)
 
 
 def _looked_at(mdp: Mdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:

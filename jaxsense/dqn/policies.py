@@ -4,7 +4,6 @@ A policy maps trained models and what a robot knows to `[N + 1]` values of actio
 which is taken; the last is NOP's. A custom policy is one more entry of a table.
 """
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
@@ -15,7 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import ConfigError
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key
-from jaxsense.dqn import hybrid
 from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team import Known, Team
@@ -46,47 +44,23 @@ class Trained(Protocol):
         """Parameters for each modality."""
         ...
 
-    @property
-    def tours(self) -> tuple[Params, ...]:
-        """Parameters of each network that orders looks."""
-        ...
-
 
 Values = Callable[[Key, Trained, Known], jax.Array]
 """`(key, models, known) -> [N + 1]` values of actions, NOP's last."""
 
+Gains = Callable[[Trained, Known], jax.Array]
+"""`(models, known) -> [R, N]` gains of each robot's next look at each PoI; above 0 if it pays."""
 
-@dataclasses.dataclass(frozen=True)
-class Policy:
-    """A policy: a function that values looks, and how missions use the values.
-
-    Attributes:
-      counts_time: `models -> bool`, whether the values include travel time, so that no other rule
-        needs to order looks.
-      is_unordered: whether looks that pay may be taken in any order, so that missions choose one,
-        see `mission.auctions` in the settings.
-      worth: `(key, models, known) -> [N]`, which looks pay: those above 0. By default, values
-        minus NOP's.
-    """
-
-    values: Values
-    counts_time: Callable[["Trained"], bool] = lambda models: False
-    is_unordered: bool = False
-    worth: Values | None = None
+Rule = Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]
+"""`(gains [R, N], times [R, N], team, robot) -> [N + 1]` values, see `nearest`."""
 
 
-def as_policy(policy: Values | Policy) -> Policy:
-    """A custom policy, of which a function alone has only values."""
-    return policy if isinstance(policy, Policy) else Policy(policy)
-
-
-def table(own: Mapping[str, Values | Policy] | None = None) -> dict[str, Policy]:
+def table(own: Mapping[str, Values] | None = None) -> dict[str, Values]:
     """All policies by name: `POLICIES`, then your own."""
-    wrapped = {name: as_policy(each) for name, each in (own or {}).items()}
-    for name, each in wrapped.items():
+    for name, each in (own or {}).items():
         if POLICIES.get(name, each) is not each:
             raise ConfigError("policies", name, f"must not be {', '.join(POLICIES)}")
-    return {**POLICIES, **wrapped}
+    return {**POLICIES, **(own or {})}
 
 
 def best(values: Float[Array, " A"]) -> Int[Array, ""]:
@@ -110,53 +84,39 @@ def expected_gain(
 
 
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Asks the trained Q-network."""
+    """Values of the trained Q-network."""
     del key
-    own, classes = _own_network(models, known), models.fusion.classes
-    return hybrid.decide(models.agent, own, models.tours, classes, known)
+    agent, belief, team = models.agent, known.belief, known.team
+    if agent.travel is None:
+        # A dense network has no input for what is not there: nothing is left to learn about it.
+        classes = models.fusion.classes
+        apart = jnp.sum((belief.mean[:, None] - classes.mean[None]) ** 2, axis=-1)
+        nearest = jax.tree.map(lambda x: jnp.asarray(x)[jnp.argmin(apart, axis=-1)], classes)
+        there = team.present[:, None]
+        belief = jax.tree.map(lambda own, x: jnp.where(there, own, x), belief, nearest)
+    own = jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
+    return agent.values(own, agent.observe(belief, team, known.times, known.robot))
 
 
-def latent_worth(key: Key, models: Trained, known: Known) -> Float[Array, " N"]:
-    """Asks the trained Q-network which looks pay."""
-    del key
-    own, classes = _own_network(models, known), models.fusion.classes
-    return hybrid.worth(models.agent, own, classes, known)
-
-
-def greedy(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes the look with the highest expected gain on the map."""
-    del key
-    return jnp.append(_gains(models, known)[known.robot], 0.0)
-
-
-def _by_exact_bayes(read: Callable[..., jax.Array]) -> Values:
+def _by_exact_bayes(read: Callable[..., jax.Array]) -> Gains:
     """Reads the values of looks at the exact posterior over the classes."""
 
-    def values(key: Key, models: Trained, known: Known) -> jax.Array:
-        del key
+    def gains(models: Trained, known: Known) -> jax.Array:
         exact = jnp.exp(known.log_posterior)
         found = [jax.vmap(read, (None, 0, 0))(x, exact, known.is_seen) for x in models.look_values]
-        return jnp.append(jnp.stack(found)[known.modality], 0.0)
+        return jnp.stack(found)[known.team.modality]
 
-    return values
-
-
-bayes = _by_exact_bayes(LookValues.of_next)
-"""Takes the look with the highest expected gain on the exact posterior over the classes."""
-
-optimal = _by_exact_bayes(LookValues.of_all)
-"""Takes the look with the highest total gain by dynamic programming on the exact posterior."""
+    return gains
 
 
-def naive(number: int) -> Values:
-    """Explores naively: every PoI gets `number` looks with each sensor, by any of its robots."""
+def _unexplored(number: int) -> Gains:
+    """Naive exploration: every PoI gets `number` looks with each sensor, by any of its robots."""
 
-    def values(key: Key, models: Trained, known: Known) -> jax.Array:
-        del key, models
-        times = known.looks[:, known.modality]
-        return jnp.append(jnp.where(times < number, 1.0, -1.0), 0.0)
+    def gains(models: Trained, known: Known) -> jax.Array:
+        del models
+        return jnp.where(known.looks.T[known.team.modality] < number, 1.0, -1.0)
 
-    return values
+    return gains
 
 
 def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -164,6 +124,21 @@ def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     del models
     number = known.looks.shape[0] + 1
     return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
+
+
+def _on_map(models: Trained, known: Known) -> jax.Array:
+    """Expected gains on the map."""
+    gain = lambda belief, seen: expected_gain(models.fusion, models.look_values, belief, seen)  # noqa: E731
+    of_modality = jax.vmap(gain, out_axes=1)(known.belief, known.is_seen)
+    return of_modality[known.team.modality]
+
+
+def highest(
+    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
+) -> Float[Array, " A"]:
+    """Rule that prefers the PoI with the highest expected gain."""
+    del times, team
+    return jnp.append(gains[agent], 0.0)
 
 
 def nearest(
@@ -225,40 +200,38 @@ def _with_nop(values: jax.Array, is_useful: jax.Array) -> jax.Array:
     return jnp.append(jnp.where(is_useful, values, -1.0), 0.0)
 
 
-def _by_rule(rule: Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]) -> Policy:
-    """A hand-written rule on expected gains and the team's travel times, see `nearest`."""
+def _by_rule(rule: Rule, gains: Gains = _on_map) -> Values:
+    """A hand-written rule on expected gains and travel times, see `nearest`."""
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         del key
-        return rule(_gains(models, known), known.times, known.team, known.robot)
+        return rule(gains(models, known), known.times, known.team, known.robot)
 
-    return Policy(values, lambda models: True)
-
-
-def _gains(models: Trained, known: Known) -> jax.Array:
-    """`[R, N]` expected gains of each robot's next look at each PoI, on the map."""
-    gain = lambda belief, seen: expected_gain(models.fusion, models.look_values, belief, seen)  # noqa: E731
-    of_modality = jax.vmap(gain, out_axes=1)(known.belief, known.is_seen)
-    return of_modality[known.team.modality]
+    return values
 
 
-def _own_network(models: Trained, known: Known) -> Params:
-    """Parameters of the Q-network of the robot's own sensor."""
-    return jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
-
-
-POLICIES: dict[str, Policy] = {
-    "latent": Policy(latent, lambda models: bool(models.tours), True, latent_worth),
-    "network": Policy(latent, lambda models: True),
-    "greedy": Policy(greedy, is_unordered=True),
-    "bayes": Policy(bayes, is_unordered=True),
-    "optimal": Policy(optimal, is_unordered=True),
-    "naive": Policy(naive(1), is_unordered=True),
-    "naive_2": Policy(naive(2), is_unordered=True),
-    "naive_3": Policy(naive(3), is_unordered=True),
-    "random": Policy(random),
+POLICIES: dict[str, Values] = {
+    "latent": latent,
+    "greedy": _by_rule(highest),
+    "bayes": _by_rule(auction, _by_exact_bayes(LookValues.of_next)),
+    "optimal": _by_rule(auction, _by_exact_bayes(LookValues.of_all)),
+    "naive": _by_rule(auction, _unexplored(1)),
+    "naive_2": _by_rule(auction, _unexplored(2)),
+    "naive_3": _by_rule(auction, _unexplored(3)),
+    "random": random,
     "nearest": _by_rule(nearest),
     "auction": _by_rule(auction),
     "rollout": _by_rule(gain_rate),
 }
-"""Built-in policies, by name."""
+"""Built-in policies, by name.
+
+`latent` is the trained Q-network. `bayes` and `optimal` take looks that pay by the next gain and by
+all gains on the exact posterior; `naive_2` looks twice with each sensor. These and `auction` divide
+the looks among the robots by an auction.
+"""
+
+UNORDERED: dict[str, Values] = {
+    "optimal": _by_rule(highest, _by_exact_bayes(LookValues.of_all)),
+    "naive": _by_rule(highest, _unexplored(1)),
+}
+"""The same without travel times, for MDPs in which the order of looks does not matter."""

@@ -19,7 +19,7 @@ _NOTHING = -1e6  # value of a PoI that is not present
 
 
 class PoolingNetwork(nn.Module):
-    """The network of a team, for its Q-values and its tours.
+    """The Q-network of robots that travel.
 
     Attributes:
       features: numbers known of each PoI; the last three are its presence and its position.
@@ -29,85 +29,41 @@ class PoolingNetwork(nn.Module):
     features: int
 
     @nn.compact
-    def __call__(
-        self, x: Float[Array, "S ..."], others: Float[Array, "S ..."] | None = None
-    ) -> Float[Array, "A ..."]:
-        """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`.
-
-        Args:
-          others: what each PoI's value takes the other PoIs to be; as in `x` by default. Presence
-            and positions are those of `x`.
-        """
+    def __call__(self, x: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
+        """`[F * N]` to `[N + 1]` values, NOP's last; or `[F * N, B]` to `[N + 1, B]`."""
         batch = x.shape[1:]
         shape = self.features, x.shape[0] // self.features, *batch
         chex.assert_shape(x, (shape[0] * shape[1], *batch))
         x = x.reshape(shape)
         present, place, known = x[-3][None], x[-2:], x[:-2]
-        layers = [
-            Dense(size, nn.initializers.he_normal(), name=f"PoI_{i}")
-            for i, size in enumerate(self.hidden)
-        ]
-        message = Dense(_MESSAGES, nn.initializers.lecun_normal(), name="Message")
 
-        def embed(known: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """What each PoI adds to the pool, and its message."""
-            flat = known.reshape(known.shape[0], -1)
-            for layer in layers:
-                flat = nn.relu(layer(flat))
-            each, sent = (x.reshape(-1, *known.shape[1:]) for x in (flat, nn.relu(message(flat))))
-            return each * present, sent * present
+        def dense(size: int, name: str, x: jax.Array, last: bool = False) -> jax.Array:
+            kind = nn.initializers.lecun_normal() if last else nn.initializers.he_normal()
+            flat = Dense(size, kind, name=name)(x.reshape(x.shape[0], -1))
+            return flat.reshape(size, *x.shape[1:])
 
-        each, sent = embed(known)
-        number = jnp.maximum(jnp.sum(present, axis=1, keepdims=True), 1.0)
-        if others is None:
-            mean = jnp.sum(each, axis=1, keepdims=True) / number
-            pool = [mean, jnp.max(each, axis=1, keepdims=True)]
-            around = _heard(sent, sent, present, place)
-        else:
-            rest, told = embed(others.reshape(shape)[:-2])
-            mean = (each + jnp.sum(rest, axis=1, keepdims=True) - rest) / number
-            pool = [mean, jnp.maximum(each, _max_of_others(rest))]
-            around = _heard(sent, told, present, place)
-        pool = jnp.concatenate(pool)
-        own = jnp.concatenate([known, each, around])
-        size = self.hidden[-1]
-        last = nn.initializers.lecun_normal()
-        context = Dense(size, nn.initializers.he_normal(), name="Context")(
-            pool.reshape(pool.shape[0], -1)
-        ).reshape(size, *pool.shape[1:])
-        of_poi = Dense(size, nn.initializers.he_normal(), name="Own")(own.reshape(own.shape[0], -1))
-        of_poi = nn.relu(of_poi.reshape(size, *known.shape[1:]) + context)
-        value = Dense(1, last, name="Value")(of_poi.reshape(size, -1))
-        value = value.reshape(*known.shape[1:])
+        each = known
+        for i, size in enumerate(self.hidden):
+            each = nn.relu(dense(size, f"PoI_{i}", each))
+        each = each * present
+        message = nn.relu(dense(_MESSAGES, "Message", each, last=True)) * present
+        number = jnp.maximum(jnp.sum(present, axis=1), 1.0)
+        pool = jnp.concatenate([jnp.sum(each, axis=1) / number, jnp.max(each, axis=1)])
+        own = jnp.concatenate([known, each, _heard(message, present, place)])
+        context = dense(self.hidden[-1], "Context", pool)
+        of_poi = nn.relu(dense(self.hidden[-1], "Own", own) + context[:, None])
+        value = dense(1, "Value", of_poi, last=True)[0]
         # Nothing follows NOP.
-        nop = jnp.zeros((1, *batch))
-        return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), nop])
+        return jnp.concatenate([jnp.where(present[0] > 0, value, _NOTHING), jnp.zeros((1, *batch))])
 
 
-def _max_of_others(x: jax.Array) -> jax.Array:
-    """`[F, N, ...]` maximum over all PoIs but this one, of `[F, N, ...]` that are not negative."""
-    most = jnp.max(x, axis=1, keepdims=True)
-    is_most = x == most
-    second = jnp.max(jnp.where(is_most, 0.0, x), axis=1, keepdims=True)
-    is_alone = jnp.sum(is_most, axis=1, keepdims=True) == 1
-    return jnp.where(is_most & is_alone, second, most)
-
-
-def _heard(own: jax.Array, others: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
+def _heard(message: jax.Array, present: jax.Array, place: jax.Array) -> jax.Array:
     """Sums the messages of all PoIs, weighted by travel time."""
     seconds = _seconds_between(place)
     near, far = (jnp.exp(-seconds / reach) for reach in _REACHES)
-
-    def heard(weights: jax.Array) -> jax.Array:
-        total = jnp.sum(weights[None] * others[:, None], axis=2)
-        if own is others:
-            return total
-        of_itself = jnp.moveaxis(jnp.diagonal(weights), -1, 0)
-        return total + of_itself[None] * (own - others)
-
+    heard = lambda weights: jnp.sum(weights[None] * message[:, None], axis=2)  # noqa: E731
     # A mean, so that many distant PoIs do not count like a near one.
-    of_far = heard(far) / (1.0 + jnp.sum(far * present, axis=1)[None])
-    return jnp.concatenate([heard(near), of_far])
+    return jnp.concatenate([heard(near), heard(far) / (1.0 + jnp.sum(far * present, axis=1)[None])])
 
 
 def _seconds_between(place: jax.Array) -> jax.Array:

@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.learning import TeamConfig
-from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.core.types import Belief, Index, Key, Novelty, pytree
 
 TIME_SCALE = 10.0
 """Unit of travel times in observations, in seconds."""
@@ -110,20 +110,27 @@ class Steps:
 
     look_seconds = 1.0
 
-    def seconds(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, ""]:
+    def seconds(
+        self, pose: Float[Array, "3"], place: Float[Array, "2"], to_go: Float[Array, ""]
+    ) -> Float[Array, ""]:
         """One step."""
-        del pose, place
+        del pose, place, to_go
         return jnp.float32(1.0)
 
-    def times(self, team: Team) -> Float[Array, "R N"]:
+    def times(self, team: Team, to_go: Float[Array, "R N"]) -> Float[Array, "R N"]:
         """One step for each robot and PoI."""
+        del to_go
         return jnp.ones(team.heads.shape)
 
     def move(
-        self, pose: Float[Array, "3"], place: Float[Array, "2"], seconds: Float[Array, ""]
+        self,
+        pose: Float[Array, "3"],
+        place: Float[Array, "2"],
+        to_go: Float[Array, ""],
+        seconds: Float[Array, ""],
     ) -> Float[Array, "3"]:
         """The pose, which stays."""
-        del place, seconds
+        del place, to_go, seconds
         return pose
 
 
@@ -143,26 +150,33 @@ class Travel:
     turn_rate: jax.Array | float = 1.2
     look_seconds: jax.Array | float = 0.7
 
-    def seconds(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, ""]:
+    def seconds(
+        self, pose: Float[Array, "3"], place: Float[Array, "2"], to_go: Float[Array, ""]
+    ) -> Float[Array, ""]:
         """Time until a robot has looked at a PoI.
 
         Args:
           pose: x [m], y [m] and yaw [rad] of the robot as it sets out.
           place: position of the PoI, in metres.
+          to_go: shortest path to where a look is new, in metres.
         """
-        turn, path = self._path(pose, place)
+        turn, path = self._path(pose, place, to_go)
         return self.look_seconds + jnp.abs(turn) / self.turn_rate + path / self.speed
 
-    def times(self, team: Team) -> Float[Array, "R N"]:
+    def times(self, team: Team, to_go: Float[Array, "R N"]) -> Float[Array, "R N"]:
         """Time until each robot has looked at each PoI, see `seconds`."""
-        of_pois = jax.vmap(self.seconds, (None, 0))
-        return jax.vmap(of_pois, (0, None))(team.poses, team.positions)
+        of_pois = jax.vmap(self.seconds, (None, 0, 0))
+        return jax.vmap(of_pois, (0, None, 0))(team.poses, team.positions, to_go)
 
     def move(
-        self, pose: Float[Array, "3"], place: Float[Array, "2"], seconds: Float[Array, ""]
+        self,
+        pose: Float[Array, "3"],
+        place: Float[Array, "2"],
+        to_go: Float[Array, ""],
+        seconds: Float[Array, ""],
     ) -> Float[Array, "3"]:
         """Pose of a robot some time after it set out for a PoI, see `seconds`."""
-        turn, path = self._path(pose, place)
+        turn, path = self._path(pose, place, to_go)
         turning = jnp.minimum(jnp.abs(turn) / self.turn_rate, seconds)
         yaw = pose[2] + jnp.sign(turn) * turning * self.turn_rate
         driven = jnp.minimum((seconds - turning) * self.speed, path)
@@ -170,15 +184,17 @@ class Travel:
         along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
         return jnp.append(pose[:2] + driven * along, yaw)
 
-    def _path(self, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """`[]` radians to turn and `[]` metres to drive until a robot is near enough to look."""
+    def _path(
+        self, pose: jax.Array, place: jax.Array, to_go: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """`[]` radians to turn and `[]` metres to drive until a robot looks, see `seconds`."""
         to_place = place - pose[:2]
         turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
         turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
         # At zero distance the bearing is undefined: do not turn.
         distance = jnp.linalg.norm(to_place)
         turn = jnp.where(distance > 0, turn, 0.0)
-        return turn, jnp.maximum(distance - self.view_distance, 0.0)
+        return turn, jnp.maximum(distance - self.view_distance, to_go)
 
 
 @pytree
@@ -228,6 +244,7 @@ class Teams:
       modalities: names of the sensors, in the order of their indices.
       alone: share of random teams that are one robot without travel, as in the paper.
       partly_seen: share of the other episodes that start with some looks already taken.
+      novelty: how new looks are after others from nearby; all are by default.
       is_random: whether in each episode only some of the robots work, at least one of each
         modality; then as many of each stand side by side.
     """
@@ -238,6 +255,7 @@ class Teams:
     modalities: tuple[str, ...] = struct.field(pytree_node=False)
     alone: jax.Array | float = 0.25
     partly_seen: jax.Array | float = 0.5
+    novelty: Novelty | None = None
     is_random: bool = struct.field(pytree_node=False, default=True)
 
     def draw(
@@ -289,9 +307,16 @@ def num_features(latent_size: int, num_modalities: int) -> int:
 
 
 def surroundings(
-    travel: Travel, belief: Belief, team: Team, agent: Int[Array, ""], num_modalities: int
+    belief: Belief,
+    team: Team,
+    times: Float[Array, "R N"],
+    agent: Int[Array, ""],
+    num_modalities: int,
 ) -> Float[Array, "F N"]:
     """What a robot of a team knows when it chooses.
+
+    Args:
+      times: seconds until each robot has looked at each PoI.
 
     Returns:
       `[F, N]`, for each PoI: mean and standard deviation of its belief; the robot's own time to
@@ -299,7 +324,6 @@ def surroundings(
       the nearest other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality,
       one number for each; whether the PoI is present; and its position relative to the robot.
     """
-    times = travel.times(team)
     soon = jnp.exp(-times / TIME_SCALE)
     carries = team.modality[None] == jnp.arange(num_modalities)[:, None]
     counts = (carries & team.others(agent)[None])[:, :, None]

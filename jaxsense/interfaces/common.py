@@ -114,7 +114,7 @@ class Robots:
         """What each robot knows."""
 
         def observation(robot: jax.Array) -> jax.Array:
-            features = self.mdp.features(state.belief, state.team, robot)
+            features = self.mdp.features(state.belief, state.team, self.mdp.times(state), robot)
             return features.T.reshape(-1) if self.scaling is None else self.scaling(features)
 
         return jax.vmap(observation)(jnp.arange(len(self.names)))

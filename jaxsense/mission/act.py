@@ -35,8 +35,8 @@ from jaxsense.sim import localisation, viewpoints, windows
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
-STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
 _GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached if a look from there is new
+STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
 _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between the centres of two robots
@@ -70,7 +70,8 @@ def approach(
 ) -> tuple[MissionState, Course]:
     """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
 
-    A robot need not get to the viewpoint itself if a look from nearby is new.
+    A robot need not get to the viewpoint itself if a look from nearby is new; where it looks again,
+    from anywhere.
 
     Returns:
       The next state, and where the robot wants to move, see `steer`.
@@ -84,7 +85,9 @@ def approach(
     is_free, sees = views(me, poi, viewpoint[None])
     is_here = own.view == num_views
     apart = me.map.apart(me.pose[None, :2], poi, me.modality)[0]
-    reach = jnp.where(models.novelty.to_go(apart, me.modality) > 0, AT_VIEWPOINT, _GOAL_DISTANCE)
+    is_new = models.novelty.to_go(apart, me.modality) <= 0
+    near = jnp.where(jnp.any(jnp.isfinite(apart)), jnp.inf, _GOAL_DISTANCE)
+    reach = jnp.where(is_new, near, AT_VIEWPOINT)
     is_there = is_here | (sees & (jnp.linalg.norm(viewpoint - me.pose[:2]) <= reach))
 
     time, is_driving = state.time, own.phase == DRIVING

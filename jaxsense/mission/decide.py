@@ -1,23 +1,18 @@
 """The choice of the PoI that a robot looks at next, and of the viewpoint.
 
-With `mission.auctions`, a policy says which looks pay, and an auction over travel times divides
-them among the robots. Without, and where values include travel time, the highest value decides.
-`ask` and `choose` read nothing but what a robot knows, so that `python -m jaxsense.export` takes
-them along.
+The action of the policy's highest value is taken. Values depend on nothing but what a
+robot knows, so that `python -m jaxsense.export` takes them along.
 """
-
-import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config.mission import MARGIN, MissionConfig
-from jaxsense.core.types import Index, Key, call, pytree
-from jaxsense.dqn.policies import Known, Policy, Values, auction
-from jaxsense.dqn.team import Team, Travel
+from jaxsense.config.mission import MARGIN
+from jaxsense.core.types import Index, Key, call
+from jaxsense.dqn.policies import Known, best
+from jaxsense.dqn.team import Team
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -32,7 +27,6 @@ from jaxsense.mission.state import (
 )
 from jaxsense.models import Models, make_travel
 from jaxsense.sim import viewpoints
-from jaxsense.vae.novelty import Novelty
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
@@ -63,9 +57,8 @@ def choices(
     policies = [*mission.policies.values()]
     known = jax.vmap(lambda state: known_to(mission, models, state, robot))(states)
     # The choice of the policy outside the batch: inside, all would be asked.
-    of_policy = lambda i: jax.vmap(lambda k, x: ask(k, policies[i], models, x))(keys, known)  # noqa: E731
-    opinions = call(of_policy, policy, len(policies))
-    return jax.vmap(functools.partial(choose, mission.config.mission))(opinions, known)
+    of_policy = lambda i: jax.vmap(lambda key, x: policies[i](key, models, x))(keys, known)  # noqa: E731
+    return jax.vmap(action_of)(call(of_policy, policy, len(policies)), known)
 
 
 @jax.named_scope("mission.set_out")
@@ -141,93 +134,20 @@ def known_to(mission: Mission, models: Models, state: MissionState, robot: Index
     of_pose = lambda pose, poi, m: me.map.apart(pose[None, :2], poi, m)[0]  # noqa: E731
     of_pois = jax.vmap(of_pose, (None, 0, None))
     apart = jax.vmap(of_pois, (0, None, 0))(team.poses, pois, team.modality)
+    to_go = jax.vmap(models.novelty.to_go)(apart, team.modality)
     return Known(
         belief=known.belief,
         looks=known.times_seen,
         log_posterior=known.log_posterior,
         team=team,
-        times=times_to_new_looks(make_travel(mission.config), models.novelty, team, apart),
+        times=make_travel(mission.config).times(team, to_go),
         robot=jnp.asarray(robot),
     )
 
 
-@pytree
-class Opinion:
-    """What a policy says to a robot that chooses.
-
-    Attributes:
-      values: of the A = N + 1 actions, NOP's last.
-      gains: of each robot's look at each PoI: above 0 if it pays.
-      counts_time: see `Policy`.
-      is_unordered: see `Policy`; without it, the gains are 0.
-    """
-
-    values: Float[Array, " A"]
-    gains: Float[Array, "R N"]
-    counts_time: Bool[Array, ""]
-    is_unordered: Bool[Array, ""]
-
-
-@jax.named_scope("mission.ask")
-def ask(key: Key, policy: Policy, models: Models, known: Known) -> Opinion:
-    """Asks a policy."""
-
-    def of_robots(function: Values) -> Float[Array, "R _"]:
-        of_one = lambda robot: function(key, models, dataclasses.replace(known, robot=robot))  # noqa: E731
-        return jax.vmap(of_one)(jnp.arange(known.times.shape[0]))
-
-    if policy.is_unordered and policy.worth is None:
-        all_values = of_robots(policy.values)
-        values, gains = all_values[known.robot], all_values[:, :-1] - all_values[:, -1:]
-    else:
-        values = policy.values(key, models, known)
-        worth = policy.worth if policy.is_unordered else None
-        gains = of_robots(worth) if worth else jnp.zeros(known.times.shape)
-    return Opinion(
-        values=values,
-        gains=gains,
-        counts_time=jnp.bool_(policy.counts_time(models)),
-        is_unordered=jnp.bool_(policy.is_unordered),
-    )
-
-
-@jax.named_scope("mission.choose")
-def choose(settings: MissionConfig, opinion: Opinion, known: Known) -> Int[Array, ""]:
-    """PoI that a robot chooses, N for NOP, or -1 if any value is NaN."""
-    values, present = opinion.values, known.team.present
-    # Values that include travel time need no order.
-    tolerance = jnp.where(opinion.counts_time, 0.0, settings.equal_values)
-    of_pois, of_nop = jnp.where(present, values[:-1], -jnp.inf), values[-1]
-    is_best = (of_pois >= jnp.max(of_pois) - tolerance) & (of_pois > of_nop)
-    by_values = _by_values(known, is_best)
-    by_auction = jnp.argmax(auction(opinion.gains, known.times, known.team, known.robot))
-    is_auction = settings.auctions & opinion.is_unordered & ~opinion.counts_time
-    choice = jnp.where(is_auction, by_auction, by_values)
-    is_nan = jnp.any(jnp.isnan(of_pois)) | jnp.isnan(of_nop)
-    return jnp.where(is_nan, -1, choice).astype(jnp.int32)
-
-
-def times_to_new_looks(
-    travel: Travel, novelty: Novelty, team: Team, apart: Float[Array, "R N K"]
-) -> Float[Array, "R N"]:
-    """Seconds until each robot has looked at each PoI from where a look is new.
-
-    Args:
-      apart: distances of each robot from earlier looks by its sensor at each PoI, in metres;
-        infinite for none.
-    """
-    metres = jax.vmap(novelty.to_go)(apart, team.modality)
-    return travel.times(team) + metres / travel.speed
-
-
-def _by_values(known: Known, is_best: Bool[Array, " N"]) -> Int[Array, ""]:
-    """One of the PoIs with the best values, by the rules; N if there is none."""
-    team, robot = known.team, known.robot
-    distance = jnp.linalg.norm(team.positions - team.poses[robot, :2][None], axis=-1)
-    # Prefer the robot's present target, then PoIs that no other robot heads for, then near ones.
-    rank = distance + _KEPT * team.heads[robot] + _HEADED_FOR * team.is_taken(robot)
-    poi = jnp.argmin(jnp.where(is_best, rank, jnp.inf))
-    return jnp.where(jnp.any(is_best), poi, distance.shape[0])
+def action_of(values: Float[Array, " A"], known: Known) -> Int[Array, ""]:
+    """The action of the highest value among those that exist, N for NOP, or -1 if one is NaN."""
+    return best(jnp.where(known.team.action_mask, values, -jnp.inf))
 
 
 @jax.named_scope("mission.best_view")

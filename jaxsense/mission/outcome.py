@@ -12,7 +12,7 @@ from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.scene import require_words
 from jaxsense.core import checks
 from jaxsense.dqn import rewards
-from jaxsense.dqn.policies import POLICIES, Policy, Values, table
+from jaxsense.dqn.policies import POLICIES, Values, table
 from jaxsense.mission.state import ENDED, FAILED, Faults, Mission, MissionState, no_faults
 from jaxsense.models import Models
 from jaxsense.sim import sensors
@@ -47,7 +47,7 @@ class Case:
 
 
 @checks.typed
-def require_playable(config: Config, policies: Mapping[str, Values | Policy] | None = None) -> None:
+def require_playable(config: Config, policies: Mapping[str, Values] | None = None) -> None:
     """Checks that missions can be made and their policies exist, before anything is trained."""
     sensors.make(config)
     known = table(policies)

@@ -13,7 +13,7 @@ from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.section import FrozenDict
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Index, others, pytree
-from jaxsense.dqn.policies import Policy, Values, table
+from jaxsense.dqn.policies import Values, table
 from jaxsense.mission.maps import Memory, OwnMap, SharedMap
 from jaxsense.mission.roadmap import Roadmap
 from jaxsense.sim import arena as arenas_of
@@ -192,7 +192,7 @@ class Mission:
     world: World
     free_arena: Arena
     config: Config
-    policies: FrozenDict[str, Policy]
+    policies: FrozenDict[str, Values]
 
     def policy(self, name: str) -> int:
         """The index of a policy."""
@@ -260,7 +260,7 @@ class Robot:
 @checks.typed
 def make_mission(
     config: Config,
-    policies: Mapping[str, Values | Policy] | None = None,
+    policies: Mapping[str, Values] | None = None,
     *,
     contacts: bool = True,
     arenas: tuple[Arena, Arena] | None = None,

@@ -16,7 +16,7 @@ import jax
 from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Key
-from jaxsense.dqn.policies import Policy, Values
+from jaxsense.dqn.policies import Values
 from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program, RowProgram
 from jaxsense.run.devices import ALONE, Workers
@@ -24,7 +24,7 @@ from jaxsense.sim.world import make_world
 from jaxsense.training import stages
 from jaxsense.training.stage import Output, Stage
 
-OwnPolicies = Mapping[str, Values | Policy]
+OwnPolicies = Mapping[str, Values]
 """Policies of a user, by name, see `dqn.policies.table`."""
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for

@@ -331,7 +331,6 @@ def _named(models: Models, config: Config) -> dict[str, PyTree]:
         "fusion": models.fusion,
         "look_values": models.look_values,
         **{learner(config, name): q_network for name, q_network in q_networks},
-        **dict(zip(("tours",), models.tours, strict=False)),
     }
 
 

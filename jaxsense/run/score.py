@@ -12,7 +12,7 @@ from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.section import require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
-from jaxsense.dqn.policies import POLICIES, Known, Policy, Trained, Values, as_policy
+from jaxsense.dqn.policies import POLICIES, Known, Trained, Values
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models, require_fitting
 from jaxsense.run import devices, missions
@@ -65,7 +65,7 @@ class MissionScore:
 def score_missions(
     config: Config,
     models: Models,
-    policies: Mapping[str, Values | Policy],
+    policies: Mapping[str, Values],
     *,
     against: Sequence[str] = AGAINST,
     episodes: int = 256,
@@ -83,7 +83,7 @@ def score_missions(
       config: settings of the arena, the robots and their sensors.
       models: trained for them, for example both from `load_pretrained`.
       policies: custom policies by name, each a pure function `(key, models, known) -> [N + 1]`
-        float values of looks at the N PoIs and of NOP, or a `dqn.Policy`.
+        float values of looks at the N PoIs and of NOP.
       against: names of policies to compare with, from `dqn.POLICIES` or `policies`. Differences are
         taken from the first.
       episodes: missions of each policy.
@@ -127,7 +127,7 @@ def score_missions(
 def _require(
     config: Config,
     models: Models,
-    policies: Mapping[str, Values | Policy],
+    policies: Mapping[str, Values],
     against: Sequence[str],
     episodes: int,
     seed: int,
@@ -141,8 +141,8 @@ def _require(
     if not (isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)):
         raise ConfigError("policies", policies, "must be a dictionary from names to policies")
     for name, each in policies.items():
-        if not (callable(each) or isinstance(each, Policy)):
-            raise ConfigError("policies", name, "must be a function or a dqn.Policy")
+        if not callable(each):
+            raise ConfigError("policies", name, "must be a function")
     names = dict.fromkeys((*POLICIES, *policies))
     if not (isinstance(against, list | tuple) and against and all(n in names for n in against)):
         expected = f"must be a list of one or more of {', '.join(names)}"
@@ -153,21 +153,21 @@ def _require(
     require_fitting(config, models)
 
 
-def _checked(name: str, policy: Values | Policy) -> Policy:
+def _checked(name: str, policy: Values) -> Values:
     """The policy, which names itself if its values have another shape or dtype."""
-    wrapped, field = as_policy(policy), f"policies[{name!r}]"
-    require_function(field, wrapped.values, 3, _IS_POLICY)
+    field = f"policies[{name!r}]"
+    require_function(field, policy, 3, _IS_POLICY)
 
     def values(key: Key, models: Trained, known: Known) -> jax.Array:
         try:
-            found = jnp.asarray(wrapped.values(key, models, known))
+            found = jnp.asarray(policy(key, models, known))
         except jax.errors.JAXTypeError as error:
-            raise ConfigError(field, wrapped.values, _IS_POLICY) from error
+            raise ConfigError(field, policy, _IS_POLICY) from error
         number = len(known.looks) + 1
         if found.shape != (number,) or not jnp.issubdtype(found.dtype, jnp.floating):
             expected = f"must return floats of shape [{number}], one for each PoI and NOP's last"
             expected = f"{expected}; not {found.dtype}{[*found.shape]}"
-            raise ConfigError(field, wrapped.values, expected)
+            raise ConfigError(field, policy, expected)
         return found
 
-    return dataclasses.replace(wrapped, values=values)
+    return values

@@ -17,7 +17,7 @@ _ROBOTS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 _POLICIES = {
     "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
     "nearest": "#cd79aa", "auction": "#d00dd4", "rollout": "#b79710", "naive": "#523a05",
-    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8", "network": "#0c0054",
+    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8",
 }  # fmt: skip
 _STYLES = dict(zip(_POLICIES, zip(_POLICIES.values(), MARKERS, strict=True), strict=True))
 _OWN_POLICY = "#0fb851", "*"

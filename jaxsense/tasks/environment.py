@@ -93,7 +93,7 @@ class Environment:
 
     def features(self, state: State) -> Float[Array, "N F"]:
         """What an observation holds of each PoI, not yet scaled."""
-        return self.mdp.features(state.belief, state.team, state.agent)
+        return self.mdp.features(state.belief, state.team, self.mdp.times(state), state.agent)
 
     def action_mask(self, state: State) -> Bool[Array, " A"]:
         """The actions that exist in a state."""

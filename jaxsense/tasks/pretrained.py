@@ -27,7 +27,7 @@ PREFIX = "pretrained:"
 """What stands before a preset's name where the directory of a run may stand, too."""
 
 # The others follow from the settings.
-PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks", "tours"
+PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -104,7 +104,7 @@ class Task(Environment):
         """
 
         def choose(key: Key, known: Known, memory: M) -> tuple[jax.Array, M]:
-            seen = self.mdp.features(known.belief, known.team, known.robot)
+            seen = self.mdp.features(known.belief, known.team, known.times, known.robot)
             action, memory = act(key, memory, self.scaling(seen))
             return known.team.existing(action), memory
 
@@ -124,7 +124,7 @@ class Task(Environment):
         else:
 
             def values(key: Key, known: Known) -> jax.Array:
-                return policies.POLICIES[name].values(key, self.models, known)
+                return {**policies.POLICIES, **policies.UNORDERED}[name](key, self.models, known)
 
         def choose(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
             of_present = jnp.where(known.team.action_mask, values(key, known), -jnp.inf)

@@ -1,4 +1,4 @@
-"""Stages of agents: values of looks, Q-learning, and tours of a team."""
+"""Stages of agents: values of looks, and Q-learning."""
 
 import dataclasses
 import functools
@@ -6,31 +6,26 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
 from jaxsense.config import Config
-from jaxsense.core import supervised
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import FitState
-from jaxsense.core.types import Belief, Fusion, Key, pytree
+from jaxsense.core.types import Belief, Fusion, Key
 from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import optimum, rewards, tours
+from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Environment, Underway
-from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import auction, expected_gain
 from jaxsense.dqn.team import alone
-from jaxsense.dqn.tours import Trials
 from jaxsense.dqn.training import DqnState
 from jaxsense.looks import Bank, Live, make_mdp
-from jaxsense.models import make_agent, make_bayes, make_prior, orders_looks
+from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
 from jaxsense.training.comparison import held_out_mdp, models_of
 from jaxsense.training.detections import Detections, Starts
-from jaxsense.training.stage import Drive, Output, Progress, Stage, in_chunks
+from jaxsense.training.stage import Drive, Output, Progress, Stage
 from jaxsense.vae import readout
 from jaxsense.vae.detectors import Detector
 
@@ -90,7 +85,7 @@ def train(
     fusion: Output,
     detectors: tuple[Output, ...],
 ) -> dict[str, Output]:
-    """Trains the Q-networks, returned by the names of their stages, and that which orders looks."""
+    """Trains the Q-networks, returned by the names of their stages."""
     given = {"detections": detections, "fusion": fusion, "detectors": detectors}
     starts = drive(Stage("starts", functools.partial(_starts, arena)), **given)
     networks: dict[str, Output] = {}
@@ -107,9 +102,6 @@ def train(
                 shares="dqn",
             )
             networks[network] = drive(stage, modality=jnp.int32(m), starts=starts, **given)
-    if orders_looks(config):
-        tour = _tour_stage(config)
-        drive(tour, look_values=look_values, fusion=fusion, detections=detections)
     return networks
 
 
@@ -193,59 +185,3 @@ def _surveyed_starts(key: Key, learning: Environment, starts: Starts, number: in
         return learning.begin(mdps.begin(begin_key, mdp, team, *of_survey))
 
     return jax.vmap(begin)(jax.random.split(key, number), starts)
-
-
-def _tour_stage(config: Config) -> Stage:
-    settings = config.team.tours
-    size, chunks = in_chunks(settings.steps)
-    number = -(-settings.states // chunks)  # of states in each chunk, in which choices are tried
-
-    def begin(key: Key, config: Config, **_: Output) -> tuple[FitState, Trials]:
-        agent = make_agent(config)
-        return supervised.start(agent.init(key), settings), tours.no_trials(agent, chunks * number)
-
-    def advance(
-        key: Key,
-        config: Config,
-        state: tuple[FitState, Trials],
-        *,
-        look_values: tuple[LookValues, ...],
-        fusion: Fusion,
-        detections: Detections,
-    ) -> tuple[tuple[FitState, Trials], Progress]:
-        """Adds trials and learns from all trials so far."""
-        fit, trials = state
-        settings = config.team.tours
-        try_key, draw_key = jax.random.split(key)
-        mdp = make_mdp(config, models_of(config, fusion), Bank(detections.bank))
-        followed = _Auction(mdp, fusion, look_values)
-        found = tours.try_choices(try_key, mdp, followed, number)
-        trials = tours.write(trials, found, fit.step // size * number)
-        problem = tours.Fitting(settings, trials, make_agent(config))
-        fit, losses = supervised.fit(draw_key, fit, problem, size)
-        return (fit, trials), Progress(losses, {})
-
-    def finish(config: Config, state: tuple[FitState, Trials], **_: Output) -> Params:
-        del config
-        return state[0].params
-
-    return Stage("tours", begin, advance, finish, settings.steps, chunks)
-
-
-@pytree
-class _Auction:
-    """The policy that robots follow in trials: an auction of gains minus the price of travel."""
-
-    mdp: Mdp
-    fusion: Fusion
-    look_values: tuple[LookValues, ...]
-
-    def read(self, belief: Belief, is_seen: Bool[Array, ""]) -> Float[Array, " M"]:
-        """`[M]` expected reward of each modality's next look."""
-        return expected_gain(self.fusion, self.look_values, belief, is_seen)
-
-    def values(self, read: Float[Array, "N M"], state: State) -> Float[Array, " A"]:
-        """`[N + 1]` values of actions."""
-        times = self.mdp.travel.times(state.team)
-        worth = read.T[state.team.modality] - self.mdp.second_cost * times
-        return auction(worth, times, state.team, state.agent)

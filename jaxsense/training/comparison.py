@@ -17,7 +17,7 @@ from jaxsense.dqn import training as dqn
 from jaxsense.dqn.episodes import Start, reference
 from jaxsense.dqn.mdp import Mdp, random_start
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Known, Policy, Values
+from jaxsense.dqn.policies import Known, Values
 from jaxsense.looks import Bank, mdp_of_one
 from jaxsense.models import Models, make_bayes, make_models
 from jaxsense.training.detections import Detections
@@ -51,7 +51,6 @@ def models_of(
         novelty=novelty.independent(len(config.modalities)),
         look_values=look_values,
         q_networks=q_networks,
-        tours=(),
     )
 
 
@@ -98,7 +97,7 @@ def compare_policies(
     models: Models,
     mdp: Mdp,
     config: Config,
-    own: Mapping[str, Values | Policy] | None = None,
+    own: Mapping[str, Values] | None = None,
 ) -> Rewards:
     """Plays episodes with `COMPARED` and custom policies, with the same looks and starts.
 
@@ -131,7 +130,7 @@ def compare_policies(
             of_each = [
                 functools.partial(optimal, known, start.state.classes)
                 if name == "optimal"
-                else functools.partial(table[name].values, key, models, known)
+                else functools.partial(table[name], key, models, known)
                 for name in names
             ]
             # By a switch, so that one program is compiled for all policies.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.models import Models, make_jmvae, make_models, make_scan_jmvae, orders_looks
+from jaxsense.models import Models, make_jmvae, make_models, make_scan_jmvae
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans, surveys
@@ -192,7 +192,6 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
         novelty=outputs["novelty"],
         look_values=outputs["look_values"],
         q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
-        tours=(outputs["tours"],) if orders_looks(config) else (),
     )
 
 
