@@ -38,7 +38,7 @@ from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
-from jaxsense.tasks.pretrained import PREFIX
+from jaxsense.tasks.registry import PREFIX
 from jaxsense.vae.jmvae import Jmvae
 
 PROGRAM = "jaxsense.export"

@@ -28,7 +28,7 @@ from jaxsense.run.settings import Settings, as_json, began, of_run, read_setting
 from jaxsense.summary.blocks import Made, Origin
 from jaxsense.summary.compare import UNKNOWN
 from jaxsense.summary.read import ORIGINS, read_made
-from jaxsense.tasks.pretrained import PREFIX, load_pretrained
+from jaxsense.tasks.registry import PREFIX, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
