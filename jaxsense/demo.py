@@ -76,7 +76,7 @@ def main(argv: list[str] | None = None) -> None:
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
                 played = _play(arguments, scenario, models, compiler)
             metrics = {name: each.metrics[name] for name, each in played.items()}
-            block = make.missions(scenario, metrics)
+            block = make.missions(config, metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"
             text = page.fill(

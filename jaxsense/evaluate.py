@@ -114,7 +114,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
             key = jax.random.key(arguments.seed)
             found = player.play(key, models, played, arguments.episodes)
             times.append(time.perf_counter())
-        block = make.missions(scenario, found.metrics)
+        block = make.missions(config, found.metrics)
         fields = scenario.fields_of_view
 
         def draw(title: str) -> str:
@@ -146,16 +146,16 @@ def _write(
     draw: Callable[[str], str],
 ) -> list[str]:
     """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
-    run, cases, written = arguments.run, blocks.cases(missions), []
+    run, written = arguments.run, []
     if arguments.animate:
-        name, elsewhere = next(iter(cases)), f"-{_place(config)}"
+        name, elsewhere = next(iter(missions)), f"-{_place(config)}"
         title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
         if config == trained:
             title, elsewhere = f"{name} policy, seed {arguments.seed}", ""
         path = run / f"mission-{name}-{arguments.seed}{elsewhere}.svg"
         files.write(path, draw(title))
         written.append(f"The first mission of {name} is in {path}.")
-    for case in cases.values():
+    for case in missions.values():
         case["seed"] = arguments.seed
     stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
     with files.locked(run, on_wait=say):
@@ -164,7 +164,7 @@ def _write(
         names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
         name = next(name for name in names if name not in others or _is_alike(others[name]))
         merged = {**(others[name]["mission"] if name in others else {}), **missions}
-        found = _evaluation(config, compare.compared(merged), rundir.origin())
+        found = _evaluation(config, merged, rundir.origin())
         path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
@@ -253,9 +253,8 @@ def _print(console: rich.console.Console, missions: blocks.Missions, episodes: i
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
             say(as_text(console, table))
-    if verdict := compare.verdict(blocks.cases(missions)):
+    if verdict := compare.verdict(missions):
         say(verdict)
-    say(compare.detection_sizes(missions))
 
 
 if __name__ == "__main__":

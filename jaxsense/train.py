@@ -332,7 +332,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
         say(as_text(console, table))
-    if verdict := compare.verdict(blocks.cases(found["mission"])):
+    if verdict := compare.verdict(found["mission"]):
         say(verdict)
     for remark in compare.remarks(found):
         say(remark)

@@ -13,7 +13,6 @@ CASE = {
     "calibration": {"confidence": 0.9975, "accuracy": 0.9985, "nll": 0.0125},
     "ended": {"finished": 127, "time limit": 1},
 }  # fmt: skip
-BYTES = {"latent": 16.0, "features": 8.0, "raw": 2326.5}
 UNAMBIGUOUS = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, True, True]}
 DETECTOR = {"accuracy": 0.9995, "ece": 0.01, "nll": 0.02}
 CURVES = "looks", "nll", "bayes_nll", "accuracy", "bayes_accuracy"
@@ -40,7 +39,7 @@ SUMMARY = {
     },
     "belief": {"doubt_correlation": 0.9375, **{name: [1, 2] for name in CURVES}},
     "dqn": {"camera": AGENT, "lidar": AGENT},
-    "mission": {"latent": CASE, "bytes_per_detection": BYTES},
+    "mission": {"latent": CASE},
 }
 OF_SEEDS = {
     **SUMMARY,
@@ -63,5 +62,5 @@ EVALUATION = {
     "side": 6.0,
     "robots": ["camera", "camera", "lidar"],
     "origin": ORIGIN,
-    "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}, "bytes_per_detection": BYTES},
+    "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}},
 }

@@ -101,7 +101,6 @@ MEASURED = {
     "goals": np.array([4]),
     "goals_reached": np.array([4]),
     "information": np.array([5.0]),
-    "detections": np.array([[2, 3]]),
     "reason": np.array([1]),
 }
 

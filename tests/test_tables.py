@@ -1,14 +1,10 @@
 """Tables of a run: which values are the best, and what is compared with the paper."""
 
 import pytest
-from summaries import BYTES, CASE, SUMMARY
+from summaries import CASE, SUMMARY
 
 from jaxsense.show import tables
 from jaxsense.summary.blocks import MISSIONS
-
-
-def played(**cases):
-    return {**cases, "bytes_per_detection": BYTES}
 
 
 @pytest.mark.parametrize(
@@ -29,23 +25,23 @@ def played(**cases):
 )
 def test_the_best_values_are_those_of_policies_about_as_accurate_as_the_best(others, best):
     cases = {name: {**CASE, **changes} for name, changes in others.items()}
-    assert tables.missions(played(latent=CASE, **cases), "").best == best
+    assert tables.missions(dict(latent=CASE, **cases), "").best == best
 
 
 def test_missions_are_compared_with_naive_exploration_where_it_was_played():
     naive = {**CASE, "time_s": 15.0, "ended": {"time limit": 1, "undetected": 2}}
-    table = tables.missions(played(latent=CASE, naive=naive), "")
+    table = tables.missions(dict(latent=CASE, naive=naive), "")
     column = table.columns.index("against naive")
     assert [texts[column] for _, texts in table.rows] == ["-8\u00a0%", "="]  # 13.8 / 15 = .92
     assert table.rows[1][1][-1] == "1\u00a0time\u00a0limit, 2\u00a0undetected"
     assert {"against naive", "unfinished", "in bold"} <= set(table.meanings)
-    assert "against naive" not in tables.missions(played(latent=CASE), "").meanings
+    assert "against naive" not in tables.missions(dict(latent=CASE), "").meanings
 
 
 def test_every_metric_of_missions_is_shown_for_who_has_it():
     alone = {**CASE, "told": 0.75, "ambiguous_reported": None, "seed": 7}
-    first, calibration = tables.all_of_missions(played(latent=CASE, camera_alone=alone))
-    absent = ("intervals.", "of_naive.", "goals_reached", "ambiguous", "seed", "ended")
+    first, calibration = tables.all_of_missions(dict(latent=CASE, camera_alone=alone))
+    absent = ("intervals.", "goals_reached", "ambiguous", "seed", "ended")
     expected = {m.label for key, m in MISSIONS.items() if not key.startswith(absent)}
     assert {*first.columns, *calibration.columns} == expected
     assert [texts[first.columns.index("right labels")] for _, texts in first.rows] == ["-", "0.750"]

@@ -151,7 +151,7 @@ def play(
     of_run = {name: cases[name] for name in config.mission.policies}
     played = player.play(stages.mission_key(key), learned.models, of_run, episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
-    return played, make.missions(player.mission, played.metrics)
+    return played, make.missions(config, played.metrics)
 
 
 def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> blocks.Agent:

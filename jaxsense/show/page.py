@@ -18,7 +18,7 @@ from jaxsense.config.options import command
 from jaxsense.core import inside
 from jaxsense.show import tables
 from jaxsense.summary import compare
-from jaxsense.summary.blocks import Evaluation, Missions, Summary, cases, mean
+from jaxsense.summary.blocks import Evaluation, Missions, Summary, mean
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")
@@ -127,23 +127,21 @@ def _films(run: Path) -> list[dict[str, Markup]]:
 
 def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
     """Section of the page about missions in the same arenas."""
-    played = cases(missions)
-    number = max(mean(case["episodes"]) for case in played.values())
+    number = max(mean(case["episodes"]) for case in missions.values())
     caption = f"{number:,.0f} missions of each policy, in the same arenas"
     found = [tables.missions(missions, caption), tables.failures(missions)]
     return {
         "title": title,
-        "verdict": compare.verdict(played),
+        "verdict": compare.verdict(missions),
         "tables": [table for table in found if table.rows],
         "details": tables.all_of_missions(missions),
-        "sizes": compare.detection_sizes(missions),
         "plot": _picture(plot),
     }
 
 
 def _title(found: Evaluation, summary: Summary) -> str:
     """What was evaluated, and with what where that is not what finished the run."""
-    seeds = {case.get("seed", 0) for case in cases(found["mission"]).values()}
+    seeds = {case.get("seed", 0) for case in found["mission"].values()}
     changed = compare.differences_of([summary, found.get("origin", compare.UNKNOWN)])
     made = "".join(f"; {name} {value}" for name, (_, value) in changed.items())
     return (

@@ -37,7 +37,6 @@ from jaxsense.summary.blocks import (
     Number,
     mean,
 )
-from jaxsense.summary.blocks import cases as cases_of
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.compare import bounds
 
@@ -339,7 +338,7 @@ def places(evaluations: Iterable[Evaluation]) -> Figure:
     """
 
     def size(place: Evaluation) -> float:
-        return max(mean(case["episodes"]) for case in cases_of(place["mission"]).values())
+        return max(mean(case["episodes"]) for case in place["mission"].values())
 
     largest = {_place(each): each for each in sorted(evaluations, key=size)}
     names = sorted(largest, key=lambda name: (largest[name]["num_pois"], largest[name]["robots"]))

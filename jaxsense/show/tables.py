@@ -18,7 +18,6 @@ from jaxsense.summary.blocks import (
     Number,
     Results,
     Timing,
-    cases,
     mean,
     policies,
     text,
@@ -141,7 +140,7 @@ def missions(block: Missions, caption: str) -> Table:
 
 def failures(block: Missions) -> Table:
     """The missions of a block `mission` in which a robot fails."""
-    failing = {name: case for name, case in cases(block).items() if is_fault(name)}
+    failing = {name: case for name, case in block.items() if is_fault(name)}
     return _missions(failing, "The latent policy, with a robot that is alone, stops or goes blind")
 
 
@@ -149,7 +148,6 @@ _CAPTIONS = {
     "": "Maps, looks and time",
     "calibration": "Calibration of the maps",
     "intervals": "Difference from the latent policy in the same arenas, with 95 % intervals",
-    "of_naive": "Ratio to naive exploration of the same accuracy",
 }
 _UNFINISHED = {
     "unfinished": (
@@ -198,7 +196,7 @@ def all_of_missions(block: Missions) -> list[Table]:
     for key, metric in MISSIONS.items():
         if key not in ("seed", "ended"):
             groups[_CAPTIONS[key.rpartition(".")[0]]].append(metric)
-    found = [_table(caption, cases(block), metrics) for caption, metrics in groups.items()]
+    found = [_table(caption, block, metrics) for caption, metrics in groups.items()]
     return [table for table in found if table.rows]
 
 
@@ -212,7 +210,7 @@ def _percent(value: Number, reference: Number) -> str:
 
 def cards(results: Results) -> list[tuple[str, str, str]]:
     """The main results: a number, its meaning, and figures to compare it with."""
-    found, played = [], cases(results["mission"])
+    found, played = [], results["mission"]
     for key, what in (
         ("observations_per_poi", "looks per PoI"),
         ("time_s", "median seconds per mission"),

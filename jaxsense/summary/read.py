@@ -12,7 +12,6 @@ from jaxsense.config import ConfigError
 from jaxsense.config.options import command
 from jaxsense.config.plain import parse_json
 from jaxsense.core import inside
-from jaxsense.summary import blocks
 from jaxsense.summary.blocks import Evaluation, Interval, Made, Missions, Results, Summary, Timed
 
 ORIGINS = "origins.json"
@@ -89,10 +88,9 @@ def _wrong(value: object, kind: type, key: str, is_mean: bool = False) -> str | 
         if missing := sorted(kind.__required_keys__ - set(value)):
             return f"{key}.{missing[0]} is missing"
         items = [(name, value[name], hints[name]) for name in hints if name in value]
-    elif kind == Missions and isinstance(value, dict) and 1 < len(value) <= _MOST_CASES:
-        kinds = {**dict.fromkeys(value, blocks.Case), blocks.TRAFFIC: blocks.Traffic}
-        items = [(name, value.get(name), each) for name, each in kinds.items()]
-    elif origin is dict and kind != Missions and isinstance(value, dict):
+    elif kind == Missions and not (isinstance(value, dict) and 0 < len(value) <= _MOST_CASES):
+        return f"{key} must hold 1 to {_MOST_CASES:,} cases"
+    elif origin is dict and isinstance(value, dict):
         items = [(name, each, inner[1]) for name, each in value.items()]
     elif origin is list and isinstance(value, list):
         items = [(str(i), each, inner[0]) for i, each in enumerate(value)]

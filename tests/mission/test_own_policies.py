@@ -91,8 +91,7 @@ def playing(*names):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("bytes_per_detection", "must not be all, policies, bytes_per_detection"),
-        ("all", "must not be all, policies, bytes_per_detection"),
+        ("all", "must not be all, policies, latent"),
         ("latent", "must not be latent, network, greedy, "),
         ("a/b", "must be a word of 1 to 64 letters"),
         (" ", "must be a word of 1 to 64 letters"),

@@ -37,10 +37,10 @@ def test_differences_are_taken_arena_by_arena():
     assert differences["time_s"]["mean"] == -2
 
 
-def block(accuracy, looks, seconds, **more):
+def block(accuracy, looks, seconds):
     # Long missions lift the mean above the median.
     times = {"time_s": seconds, "mean_time_s": seconds + 10}
-    return {"accuracy": accuracy, "observations_per_poi": looks, **times, "episodes": 8, **more}
+    return {"accuracy": accuracy, "observations_per_poi": looks, **times, "episodes": 8}
 
 
 NAIVE = {
@@ -48,53 +48,6 @@ NAIVE = {
     "naive_2": block(0.96, 4.0, 50.0),
     "naive_3": block(0.98, 6.0, 60.0),
 }
-
-
-@pytest.mark.parametrize(
-    ("accuracy", "looks", "seconds"),
-    [
-        (0.93, 3.0, 45.0),  # half way from one look to two
-        (0.97, 5.0, 55.0),
-        (0.98, 6.0, 60.0),
-        (0.99, 6.0, 60.0),  # no better than three looks
-    ],
-)
-def test_naive_exploration_of_the_same_accuracy_is_interpolated(accuracy, looks, seconds):
-    found = compare.of_naive({**NAIVE, "latent": block(accuracy, 1.5, 30.0)}, "latent")
-    times = {"time_s": 30 / seconds, "mean_time_s": 40 / (seconds + 10)}
-    expected = {"observations_per_poi": 1.5 / looks, **times}
-    assert found == pytest.approx(expected)
-
-
-def test_looks_of_naive_exploration_that_do_not_help_are_left_out():
-    worse = {**NAIVE, "naive_3": block(0.95, 6.0, 60.0), "latent": block(0.99, 2.0, 30.0)}
-    # The most accurate is naive_2, with 4 looks.
-    assert compare.of_naive(worse, "latent")["observations_per_poi"] == 0.5
-    alike = {f"naive{k}": block(1.0, looks, 40.0) for k, looks in (("", 2), ("_2", 4), ("_3", 6))}
-    found = compare.of_naive({**alike, "latent": block(1.0, 1.6, 30.0)}, "latent")
-    assert found["observations_per_poi"] == 0.8
-
-
-def test_there_is_nothing_to_compare_with_below_one_look_or_without_all_three():
-    assert compare.of_naive({**NAIVE, "latent": block(0.89, 1.0, 9.0)}, "latent") is None
-    two = {name: NAIVE[name] for name in ("naive", "naive_2")}
-    assert compare.of_naive({**two, "latent": block(0.97, 1.0, 9.0)}, "latent") is None
-    assert compare.of_naive(NAIVE, "latent") is None
-
-
-def test_ratios_are_computed_anew_beside_what_stays():
-    latent = block(0.97, 1.5, 30.0, of_naive={"time_s": 7.0})
-    of_latent = {"accuracy": {"mean": -0.01, "low": -0.02, "high": 0.0}}
-    naive = {name: {**each, "intervals": of_latent} for name, each in NAIVE.items()}
-    size = {"latent": 16.0, "features": 8.0, "raw": 2000.0}
-    found = compare.compared({**naive, "latent": latent, "bytes_per_detection": size})
-    assert found["latent"]["of_naive"] == compare.of_naive({**NAIVE, "latent": latent}, "latent")
-    assert all(found[name]["intervals"] == of_latent for name in NAIVE)
-    assert found["bytes_per_detection"] == size
-    # Without naive exploration, nothing of it is left.
-    assert compare.compared({"latent": latent}) == {"latent": block(0.97, 1.5, 30.0)}
-
-
 FASTER = "By median times, the latent policy is 10 % faster than naive exploration"
 LESS = "It labels 80.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."
 MORE = "It labels 97.0\u00a0% of the PoIs right, naive exploration 90.0\u00a0%."

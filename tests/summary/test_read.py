@@ -29,7 +29,7 @@ def test_a_summary_is_read_with_keys_of_later_versions(tmp_path):
         ("mission.latent.time_s", "x", "summary.mission.latent.time_s has the wrong type"),
         ("mission.latent.time_s", {}, "summary.mission.latent.time_s has the wrong type"),
         ("mission.latent.accuracy", True, "accuracy has the wrong type"),
-        ("mission.bytes_per_detection", 3, "bytes_per_detection has the wrong type"),
+        ("mission.latent", 3, "summary.mission.latent has the wrong type"),
         ("jmvae.unambiguous.joint", [1], "summary.jmvae.unambiguous.joint.0 has the wrong type"),
         ("belief", [], "summary.belief has the wrong type"),
         ("seeds", {"3": {}}, "summary.seeds.3.belief is missing"),
