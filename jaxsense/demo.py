@@ -52,10 +52,6 @@ class Arguments(Checked):
     browser: bool = True
     cache: Path | None = cli.CACHE
 
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
-
 
 def main(argv: list[str] | None = None) -> None:
     """Runs the program.
@@ -70,9 +66,9 @@ def main(argv: list[str] | None = None) -> None:
         config, models = load_pretrained(arguments.preset)
         scenario = mission.make_mission(config)
         scenario.policy(arguments.policy)
+        kept = cli.keep_programs(PROGRAM, arguments.cache, config)
         # Before a minute of work.
         with rundir.begun(arguments.out, f"demo-{arguments.preset}") as place:
-            kept = cli.keep_programs(PROGRAM, arguments.cache, config)
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
                 played = _play(arguments, scenario, models, compiler)
             metrics = {name: each.metrics[name] for name, each in played.items()}

@@ -79,10 +79,6 @@ class Arguments(Checked):
     animate: bool = False
     trust: bool = False
 
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
-
 
 def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> None:
     """Runs the program.
@@ -101,11 +97,11 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         scenario = mission.make_mission(config, policies)
         played = _cases(arguments, scenario)
         scenario = scenario.playing(case.policy for case in played.values())
+        kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
-        kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
         with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
             number, times = arguments.episodes * len(played), [time.perf_counter()]
             player = missions.Player(scenario, compiler, number, workers)

@@ -19,7 +19,7 @@ import rich.console
 import rich.table
 
 from jaxsense.config import PRESETS, Config, ConfigError
-from jaxsense.config.options import Name, OptionError, command, read_some
+from jaxsense.config.options import Name, OptionError, command, options_of, split
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
@@ -80,10 +80,6 @@ class Arguments(Checked):
     num_processes: int | None = None
     process_index: int | None = None
     cache: Path | None = cli.CACHE
-
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
 
 
 def main(
@@ -167,13 +163,13 @@ def parse(
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, needed before those are read."""
-    given = read_some(Arguments, argv, ("--resume", "--config", "--trust", "--preset"))
-    is_trusted = given.get("--trust") is True
-    if isinstance(resume := given.get("--resume"), Path):
+    given, _ = split([*options_of(Arguments)], argv)
+    is_trusted = given.get(("trust",)) is True
+    if isinstance(resume := given.get(("resume",)), Path):
         return resumable(resume, is_trusted)
-    if isinstance(file := given.get("--config"), Path):
+    if isinstance(file := given.get(("config",)), Path):
         return read_settings(file, is_trusted)
-    preset = str(given.get("--preset", "default"))
+    preset = str(given.get(("settings", "preset"), "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     return Settings(preset, 0, change(PRESETS[preset]))

@@ -1,8 +1,10 @@
-"""Settings as options of a command line: fields of dataclasses, described by the class."""
+"""Settings as plain data, the form of `config.json`, and as options of a command line."""
 
 import contextlib
 import dataclasses
+import difflib
 import inspect
+import json
 import math
 import re
 import shlex
@@ -14,10 +16,106 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
-from jaxsense.config.plain import FORMER, made, nearest
+from jaxsense.config.section import ConfigError
+from jaxsense.config.whole import Config
 
 T = TypeVar("T")
 _LONGEST = 80  # characters of a word that an error repeats
+
+
+def as_plain(config: Config) -> dict[str, Any]:
+    """Converts settings to dictionaries, lists, numbers and strings, for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_plain(stored: object, base: Config | None = None) -> Config:
+    """Makes settings from plain data, the inverse of `as_plain`.
+
+    Args:
+      stored: sections and their fields.
+      base: source of missing settings; the defaults by default.
+
+    Raises:
+      ConfigError: names a field that is unknown, of the wrong type, or invalid.
+    """
+    return cast(Config, _made(Config, stored, base or Config()))
+
+
+def _made(kind: Any, stored: object, base: object = None, place: str = "") -> object:
+    """A value of a type, its missing fields from `base`; dataclasses check their fields."""
+    if not dataclasses.is_dataclass(kind):
+        if isinstance(stored, dict) and len(inner := get_args(kind)) == 2:
+            return {n: _made(inner[1], each, None, f"{place}.{n}") for n, each in stored.items()}
+        return stored
+    if not isinstance(stored, dict):
+        raise ConfigError(place or "config", stored, "must be an object with names and values")
+    kinds, given = get_type_hints(kind), {}
+    for name, value in stored.items():
+        path = f"{place}.{name}".lstrip(".")
+        if name not in kinds:
+            near = _nearest(path, [*flat(as_plain(Config()))])
+            hint = f"; did you mean {' or '.join(near)}?" if near else ""
+            raise ConfigError(path, value, f"unknown setting{hint}")
+        default = getattr(kind if base is None else base, name, None)
+        given[name] = _made(kinds[name], value, default, path)
+    if base is not None:
+        return dataclasses.replace(cast(Any, base), **given)
+    for field in dataclasses.fields(kind):
+        if field.name not in given and field.default is dataclasses.MISSING:
+            raise ConfigError(place, stored, f"missing setting {field.name}")
+    return kind(**given)  # pyright: ignore[reportCallIssue]
+
+
+def without_former(stored: Mapping[str, Any], section: object | None = None) -> dict[str, Any]:
+    """Plain settings of models that travel with the package, without what are constants now."""
+    now, kept = vars(section or Config()), {}
+    for name, value in stored.items():
+        if dataclasses.is_dataclass(now.get(name)):
+            kept[name] = without_former(value, now[name])
+        elif name in now and isinstance(value, dict) == isinstance(now[name], dict):
+            kept[name] = value
+    return kept
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
+    """Plain settings by `section.name`."""
+    found: dict[str, object] = {}
+    for name, value in settings.items():
+        inner = flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else None
+        found |= {f"{prefix}{name}": value} if inner is None else inner
+    return found
+
+
+def _nearest(path: str, names: Sequence[str]) -> list[str]:
+    """The names nearest to an unknown one, of its section or else of any."""
+    section, _, last = path.rpartition(".")
+    apart = [name.rpartition(".") for name in names]
+    for known in ([name for name in apart if name[0] == section], apart):
+        for near in difflib.get_close_matches(last, [name[2] for name in known], 1, 0.7):
+            return ["".join(name) for name in known if name[2] == near]
+    return []
+
+
+def parse_json(content: bytes) -> object:
+    """Parses JSON strictly: UTF-8, no deep nesting, no field twice, no half of a character.
+
+    Raises:
+      ValueError: if the content is not such JSON.
+    """
+    try:
+        found = json.loads(content.decode(), object_pairs_hook=_without_twins)
+        json.dumps(found, ensure_ascii=False).encode()
+        return found
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
+    names = [name for name, _ in fields]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name!r} appears twice")
+    return dict(fields)
 
 
 class OptionError(ValueError):
@@ -119,7 +217,7 @@ def read(base: T | type[T], argv: list[str]) -> T:
       ConfigError: by the dataclass, for a value that is wrong.
     """
     options = [*options_of(base)]
-    values, rest = _split(options, argv)
+    values, rest = split(options, argv)
     for option in options:
         if not option.name.startswith("-") and rest and not _is_option(rest[0]):
             number = 1 if option.words[1] is None else len(rest)
@@ -133,7 +231,7 @@ def read(base: T | type[T], argv: list[str]) -> T:
     plain: dict[str, Any] = {} if isinstance(base, type) else dataclasses.asdict(cast(Any, base))
     for path, value in values.items():
         plain = _changed(plain, path, value)
-    return cast(T, made(kind, plain))
+    return cast(T, _made(kind, plain))
 
 
 def _changed(plain: Mapping[str, Any], path: Sequence[str], value: object) -> dict[str, Any]:
@@ -142,24 +240,14 @@ def _changed(plain: Mapping[str, Any], path: Sequence[str], value: object) -> di
     return {**plain, name: _changed(plain.get(name, {}), rest, value) if rest else value}
 
 
-def read_some(arguments: type, argv: list[str], names: Sequence[str]) -> dict[str, object]:
-    """Reads some options of a dataclass before the defaults of the others are known.
-
-    Returns:
-      Values on the command line, by name; text where the type is wrong.
-
-    Raises:
-      OptionError: if the value of one of these options is missing.
-    """
-    options = {option.path: option for option in options_of(arguments) if option.name in names}
-    values, _ = _split([*options.values()], argv)
-    return {options[path].name: value for path, value in values.items()}
-
-
-def _split(
+def split(
     options: list[Option], argv: list[str]
 ) -> tuple[dict[tuple[str, ...], object], list[str]]:
-    """The values on a command line by their paths, and the words that belong to no option."""
+    """The values on a command line by their paths, and the words that belong to no option.
+
+    Raises:
+      OptionError: if a value is missing.
+    """
     named = {option.name: option for option in options}
     named |= {option.off: option for option in options if option.kind is bool}
     values: dict[tuple[str, ...], object] = {}
@@ -213,9 +301,7 @@ def _unknown(words: list[str], names: list[str]) -> str:
     name = word.partition("=")[0]
     if not word.startswith("-"):
         return f"unexpected argument '{_cut(word)}': options start with --"
-    if re.sub(r"^--(no-)?", "", name).replace("-", "_") in FORMER:
-        return f"{_cut(name)} is no longer an option"
-    near = nearest(name[2:], [each[2:] for each in names if each.startswith("--")])
+    near = _nearest(name[2:], [each[2:] for each in names if each.startswith("--")])
     hint = f"did you mean --{near[0]}?" if near else "see --help-all"
     return f"unknown option {_cut(name)}; {hint}"
 

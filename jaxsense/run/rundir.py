@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.plain import parse_json
+from jaxsense.config.options import parse_json
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import inside
 from jaxsense.models import Models

@@ -5,7 +5,7 @@ import contextlib
 import json
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -14,7 +14,7 @@ import jinja2
 from markupsafe import Markup
 
 from jaxsense.config import PRESETS, Config, as_plain
-from jaxsense.config.options import command
+from jaxsense.config.options import command, flat
 from jaxsense.core import inside
 from jaxsense.show import tables
 from jaxsense.summary import compare
@@ -159,18 +159,9 @@ def _picture(path: Path) -> str | None:
 
 def _changed(config: Config, preset: str) -> dict[str, tuple[str, str]]:
     """Settings that differ from the preset's: their value, and the preset's."""
-    before = dict(_flat(as_plain(PRESETS.get(preset, config))))
+    before = flat(as_plain(PRESETS.get(preset, config)))
     return {
         name: (json.dumps(value), json.dumps(before.get(name)))
-        for name, value in _flat(as_plain(config))
+        for name, value in flat(as_plain(config)).items()
         if value != before.get(name)
     }
-
-
-def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Nested settings as `section.name`."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -9,8 +9,7 @@ from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, ge
 from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError
-from jaxsense.config.options import command
-from jaxsense.config.plain import parse_json
+from jaxsense.config.options import command, parse_json
 from jaxsense.core import inside
 from jaxsense.summary.blocks import Evaluation, Interval, Made, Missions, Results, Summary, Timed
 

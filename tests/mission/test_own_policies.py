@@ -91,7 +91,7 @@ def playing(*names):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("all", "must not be all, policies, latent"),
+        ("all", "must not be all, policies"),
         ("latent", "must not be latent, network, greedy, "),
         ("a/b", "must be a word of 1 to 64 letters"),
         (" ", "must be a word of 1 to 64 letters"),
