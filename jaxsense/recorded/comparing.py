@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import Config
+from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.recorded.reading import RecordedLooks
 from jaxsense.sim import arena as arenas
@@ -50,6 +51,7 @@ class Compared:
         )
 
 
+@checks.typed
 def compare(config: Config, looks: RecordedLooks) -> dict[str, Compared]:
     """Compares recorded looks with simulated ones at the same bearing and distance.
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsense.config import Config
+from jaxsense.core import checks
 from jaxsense.recorded import resampling
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
@@ -36,6 +37,7 @@ class RecordedLooks:
         return bearing.astype(np.float32), np.hypot(x, y).astype(np.float32)
 
 
+@checks.typed
 def read(config: Config, file: Path | str) -> RecordedLooks:
     """Reads a recording, a file of NumPy's format `.npz`.
 

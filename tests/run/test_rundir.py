@@ -172,7 +172,7 @@ def test_a_run_records_the_commit_of_its_source(tmp_path):
     assert version.commit(tmp_path) == head
     (tmp_path / "file").write_text("2")
     assert version.commit(tmp_path) == f"{head}-dirty"
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     with RunDirectory.create(tmp_path / "run", SETTINGS) as run:
         content = json.loads((run.path / "config.json").read_text("utf-8"))
     # Tests may run away from the source tree, and that without Git.

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from refusals import ANYTHING, FIELDS, NAN, NUMBERS, PARTS, SECTIONS, SMOKE, check_message
 from smoke import error_line
 
-from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape, learn
+from jaxsense import Attribute, Config, ConfigError, SensorConfig, Shape
 from jaxsense.config import as_plain, from_plain
-from jaxsense.config.mission import CommunicationConfig
+from jaxsense.config.mission import CommunicationConfig, LocalisationConfig
 from jaxsense.config.options import without_former
 from jaxsense.config.scene import COLOURS, SHAPES, ArenaConfig
 from jaxsense.config.section import Limits, described, fields_of
@@ -135,7 +135,12 @@ CHANGES = [
         FROM_SCANS | OF_SIXTEEN | {"detector.num_held_out": 16},
         "detector.num_held_out = 16: leaves some of 16 classes without a look; raise it",
     ),
+    (
+        {"jmvae.learns_from": "scans"},
+        "jmvae.fusion = 'in_place': must be filter, because learns_from = scans",
+    ),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
+    ({"modalities": ("camera", "sonar")}, "must be among camera, lidar"),
     (
         {
             "arena.attributes": {"heat": Attribute({"hot": 1.0, "cold": 0.0})},
@@ -168,10 +173,20 @@ CHANGES = [
         "camera.field_of_view = 30.0: must be at least 42 degrees",
     ),
     ({"lidar.window": 684}, "lidar.window = 684: must be at most 683: it has 683 rays, with a"),
+    ({"camera.window": 161}, "camera.window = 161: must be at most 160: it has 640 rays, with a"),
     ({"lidar.max_range": 0.08}, "lidar.max_range = 0.08: must be above min_range = 0.08"),
+    ({"lidar.window_range": 0.08}, "lidar.window_range = 0.08: must be above min_range = 0.08"),
+    ({"lidar.range_noise": 5.1}, "lidar.range_noise = 5.1: must be at most max_range = 5.0"),
+    # The corner of a PoI, a robot and .03 m: .1414 + .0495 + .03.
+    ({"viewpoint.min_distance": 0.22}, "viewpoint.min_distance = 0.22: must be at least 0.221 m"),
     ({"viewpoint.min_distance": 1.2}, "max_distance = 1.2: must be above min_distance = 1.2"),
     ({"viewpoint.max_distance": 1.6}, "must be at most half the arena's side, 1.5 m"),
     ({"navigation.view_range": 1.3}, "= 1.3: must be at most viewpoint.max_distance = 1.2 m"),
+    ({"navigation.view_range": 0.29}, "navigation.view_range = 0.29: must be at least 0.300 m"),
+    (
+        {"mdp.partly_seen_starts": True, "arena.num_pois": 16, "arena.side": 6.0},
+        "must be off: it needs 2 to 30 pairs of PoI and modality, and there are 32",
+    ),
     (
         {"detector.calibration": 0.5, "detector.num_scans": 1, "arena.num_pois": 1},
         "detector.calibration = 0.5: leaves none of 1 scans to train on; lower it",
@@ -224,6 +239,56 @@ def test_settings_that_cannot_be_used_are_named(changes, expected):
     assert expected in message(changed, changes)
 
 
+AT_LIMITS = [
+    {"navigation.view_range": 1.2},
+    {"navigation.view_range": 0.3},
+    {"viewpoint.max_distance": 1.5},
+    {"lidar.range_noise": 5.0},
+    {"lidar.window": 683},
+    {"camera.window": 160},
+    {"camera.field_of_view": 42.0},
+    {"arena.num_pois": 25},
+    {"mdp.partly_seen_starts": True, "arena.num_pois": 15, "arena.side": 6.0},
+    {"arena.attributes": {"heat": Attribute({"hot": 60.0})},
+     "arena.classes": ("red cube hot", "green cube hot"),
+     "sensors": {"thermal": SensorConfig("own:thermal", "heat")}},
+    {"arena.colours": {"red": COLOURS["red"]}, "arena.classes": REDS},
+    {"arena.shapes": {"cube": SHAPES["cube"]}, "arena.classes": ("red cube", "green cube")},
+    {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN},
+    {"mission.localisation": LocalisationConfig(search=(0.3, 30.0), error=(1.0, 180.0))},
+    {"dqn.epochs": 100, "dqn.replay_capacity": 32},
+    {"dqn.epochs": 970},  # in chunks of 10
+    {"team.num_pois": (3, 3), "team.sides": (4.0, 4.0)},
+    FROM_SCANS | {"lidar.num_beams": 77, "lidar.window": 20},
+    FROM_SCANS | {"lidar.window": 512},
+    FROM_SCANS | {"lidar.window": 3, "lidar.window_range": 1.2},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", AT_LIMITS, ids=count())
+def test_settings_just_at_their_limits_are_used(changes):
+    assert changed(changes) != SMOKE
+
+
+@pytest.mark.parametrize(
+    ("limits", "inside", "outside"),
+    [
+        ({}, [0, 2**31 - 1, 1 - 2**31], [2**31, -(2**31)]),
+        ({}, [0.0, 1e-30, -1e30], [1e-31, 2e30, NAN]),
+        ({"above": 0}, [1], [0]),
+        ({"at_least": 0}, [0], [-1]),
+        ({"below": 3}, [2], [3]),
+        ({"at_most": 3}, [3], [4]),
+        ({"at_most": 2**32 - 1}, [2**32 - 1], [2**32]),  # seeds
+    ],
+)
+def test_limits_allow_the_numbers_within(limits, inside, outside):
+    found = Limits(**limits)
+    for numbers, is_allowed in ((inside, True), (outside, False)):
+        for x in numbers:
+            assert found.allow(x, is_whole=isinstance(x, int)) == is_allowed
+
+
 HEAT = Attribute({"hot": 60.0, "cold": 5.0})
 
 
@@ -234,6 +299,11 @@ HEAT = Attribute({"hot": 60.0, "cold": 5.0})
         (lambda: Shape("cylinder", (1.0, 0.5)), "must be the same number twice for a cylinder"),
         (lambda: Attribute({"hot": "x"}), "attribute.values = {'hot': 'x'}: must be a dictionary"),  # pyright: ignore
         (lambda: Attribute({}), "must name one or more"),
+        (lambda: Attribute({"very hot": 1.0}), "attribute.values = 'very hot': must be a word"),
+        (lambda: ArenaConfig(attributes={"a b": HEAT}), "arena.attributes = 'a b': must be a word"),
+        (lambda: ArenaConfig(colours={"": (1, 0, 0)}), "arena.colours = '': must be a word"),
+        (lambda: ArenaConfig(shapes={}), "arena.shapes = {}: must name one or more"),
+        (lambda: SMOKE.attribute("sonar"), "modality = 'sonar': must be one of camera, lidar"),
         (lambda: SensorConfig("a.b", "shape"), "must be package.module:function"),
         (lambda: SensorConfig(3, "shape"), "sensor.make = 3: must be text"),  # pyright: ignore
         (lambda: ArenaConfig(num_pois=np.int64(3)), "arena.num_pois = np.int64(3): must be a whol"),  # pyright: ignore
@@ -312,14 +382,8 @@ def test_settings_of_trained_models_load_without_what_are_constants_now():
     assert without_former(stored) == {"mission": {"localisation": {}}, "filter": {"steps": 5}}
 
 
-NO_64_BITS = "JAX_ENABLE_X64 = True: must be off, as jaxsense computes in 32 bits"
-
-
-def test_64_bits_are_refused(tmp_path, monkeypatch, capsys):
-    key = jax.random.key(0)
+def test_a_command_refuses_64_bits(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with jax.enable_x64(True):
-        with pytest.raises(ConfigError, match=f"^{NO_64_BITS}"):
-            learn(key, Config())
-        assert NO_64_BITS in error_line([], capsys)
+        assert "JAX_ENABLE_X64 = True: must be off" in error_line([], capsys)
     assert not list(tmp_path.iterdir())
