@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -15,8 +14,7 @@ from untrained import blank
 
 import jaxsense
 from jaxsense import train
-from jaxsense.config import PRESETS, Shape
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.config import PRESETS
 from jaxsense.show import drawing
 from jaxsense.summary.read import read_summary
 
@@ -110,47 +108,3 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     line = error_line([*SMOKE, "--out", str(smoke_run)], capsys)
     assert f"out = {str(smoke_run)!r}: is not empty; must be a new or empty directory" in line
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
-
-
-def test_all_help_explains_every_field(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as stop:
-        train.main(["--help-all"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 80
-    options = re.findall(r"^  (--\S+)", text, re.MULTILINE)
-    assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
-    assert "(default: on; --mission.no-auctions turns it off)" in " ".join(text.split())
-    # Each option has a text.
-    assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
-
-
-def test_every_kind_of_option_is_read(tmp_path):
-    words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
-        --mission.no-auctions --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
-        --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
-        --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
-    arguments = train.parse(words.split())
-    config, smoke = arguments.settings.config, PRESETS["smoke"]
-    assert (arguments.settings.seed, arguments.cache, arguments.devices) == (4, None, None)
-    assert arguments.quiet is False
-    assert (config.arena.side, config.arena.num_pois) == (4.0, 4)
-    assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
-    assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
-    assert config.mdp.partly_seen_starts is True
-    assert config.mission == dataclasses.replace(smoke.mission, auctions=False)
-    assert config.team == dataclasses.replace(
-        smoke.team, travel=dataclasses.replace(smoke.team.travel, view_distance=0.3)
-    )
-    assert config.robots == ("camera", "camera", "lidar")
-    assert config.dqn == dataclasses.replace(smoke.dqn, hidden=(8,), observe="live")
-    # Of a stored run, of which other options change settings; then without an option's value.
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 7, config)):
-        file = str(tmp_path / "run" / "config.json")
-        again = train.parse(["--config", file, "--robots", "None", "--arena.side", "5"])
-        resumed = train.parse(["--resume", str(tmp_path / "run")])
-    given = again.settings
-    assert (given.seed, given.preset, given.config.robots) == (7, "smoke", None)
-    assert given.config.arena == dataclasses.replace(config.arena, side=5.0)
-    assert resumed.settings == Settings("smoke", 7, config)

@@ -6,6 +6,7 @@ import pickle
 from itertools import count
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -307,6 +308,7 @@ HEAT = Attribute({"hot": 60.0, "cold": 5.0})
         (lambda: SensorConfig("a.b", "shape"), "must be package.module:function"),
         (lambda: SensorConfig(3, "shape"), "sensor.make = 3: must be text"),  # pyright: ignore
         (lambda: ArenaConfig(num_pois=np.int64(3)), "arena.num_pois = np.int64(3): must be a whol"),  # pyright: ignore
+        (lambda: ArenaConfig(num_pois=jnp.int32(3)), "arena.num_pois = Array(3"),  # not traced
         (lambda: Config(5), "modalities = 5: must be a list of 1 to 8"),  # pyright: ignore
         (lambda: ArenaConfig(attributes={"shape": HEAT}), "arena.attributes = 'shape': already e"),
         (
