@@ -1,4 +1,6 @@
-"""A whole summary, made up."""
+"""A whole summary, made up, and metrics of two missions."""
+
+import numpy as np
 
 AGENT = {
     "return": 1.2345, "optimal": 1.25, "greedy": 1.24, "naive": 1.0, "random": -1.5,
@@ -63,4 +65,21 @@ EVALUATION = {
     "robots": ["camera", "camera", "lidar"],
     "origin": ORIGIN,
     "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}},
+}
+FOUND = {
+    "classes": np.array([[0, 1, 2], [2, 2, 1]]),
+    "is_right": np.array([[True, True, False], [True, True, True]]),
+    "ambiguous": np.array([[False, True, False], [True, True, False]]),
+    # The third PoI of the second mission was never detected: .9, .8, .4, .7 and 1 count.
+    "seen": np.array([[True, True, True], [True, True, False]]),
+    "confidence": np.array([[0.9, 0.8, 0.4], [0.7, 1.0, 0.2]]),
+    "nll": np.array([[0.1, 0.2, 1.5], [0.3, 0.0, 9.0]]),
+    "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
+    "observations_per_poi": np.array([1.0, 2.0]),
+    "time_s": np.array([10.0, 20.0]),
+    "collisions": np.array([0, 2]),
+    "goals": np.array([4, 6]),
+    "goals_reached": np.array([4, 5]),
+    "information": np.array([5.0, 6.0]),
+    "reason": np.array([1, 2]),
 }

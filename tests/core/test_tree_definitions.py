@@ -1,7 +1,5 @@
 """The class belongs to the tree definition: no program of one class runs with another."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 from flax import serialization
 
 from jaxsense import sim
-from jaxsense.config import Config
 from jaxsense.core.types import Belief, pytree
 
 
@@ -66,15 +63,3 @@ def test_a_sensor_that_is_defined_again_runs_its_own_program():
     own = [own_sensor(float(value)) for value in range(12)]
     assert [float(read(sensor)) for sensor in own] == list(range(12))
     assert jax.tree.structure(own[0]) != jax.tree.structure(own[1])
-
-
-def test_a_traced_setting_does_not_switch_off_the_checks_of_others():
-    config = Config()
-
-    def change(distance, **wrong):
-        viewpoint = dataclasses.replace(config.viewpoint, min_distance=distance)
-        return dataclasses.replace(config, viewpoint=viewpoint, **wrong).viewpoint.min_distance
-
-    assert float(jax.jit(change)(0.4)) == pytest.approx(0.4)
-    with pytest.raises(ValueError, match="robots"):
-        jax.jit(lambda x: change(x, robots=("camera", "nose")))(0.4)

@@ -34,7 +34,7 @@ def test_a_scan_along_no_directions_is_refused(angles, ranges, expected):
 def test_distances_are_interpolated_on_a_surface_and_nearest_at_an_edge():
     angles = degrees(-35, -25, -15, -5, 5, 15, 25, 35)
     #                     surface          edge      no return
-    readings = np.array([[1.0, 1.08, 1.04, 3.0, 3.02, np.inf, np.inf, 2.0]])
+    readings = np.array([[1.0, 1.08, 1.04, 3.0, 3.02, 0.0, np.inf, 2.0]])
     found = resample(LIDAR, angles + degrees(1)[0], readings)[0]
     # The ray at -40 is 6 degrees beyond the first, more than half a step; that at 40 is 4 beyond.
     np.testing.assert_array_equal(np.isnan(found), [True, *[False] * 8])
@@ -67,9 +67,9 @@ def test_a_full_circle_is_closed():
 
 def test_pixels_are_interpolated_for_each_channel():
     angles = np.linspace(0.8, -0.8, 60)
-    colour = np.stack([angles, angles**2, np.ones(60)], axis=-1)[None]
+    colour = np.stack([angles, angles**2, np.zeros(60)], axis=-1)[None]
     found = resample(CAMERA, angles, colour)[0]
-    expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.ones(8)], axis=-1)
+    expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.zeros(8)], axis=-1)
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from summaries import FOUND
 
 from jaxsense.config import PRESETS, Config, JmvaeConfig
 from jaxsense.config.learning import EvaluationConfig
@@ -12,24 +13,6 @@ from jaxsense.training.comparison import permutations
 
 CONFIG = PRESETS["smoke"]
 RETURNS = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal"
-
-FOUND = {
-    "classes": np.array([[0, 1, 2], [2, 2, 1]]),
-    "is_right": np.array([[True, True, False], [True, True, True]]),
-    "ambiguous": np.array([[False, True, False], [True, True, False]]),
-    # The third PoI of the second mission was never detected: .9, .8, .4, .7 and 1 count.
-    "seen": np.array([[True, True, True], [True, True, False]]),
-    "confidence": np.array([[0.9, 0.8, 0.4], [0.7, 1.0, 0.2]]),
-    "nll": np.array([[0.1, 0.2, 1.5], [0.3, 0.0, 9.0]]),
-    "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
-    "observations_per_poi": np.array([1.0, 2.0]),
-    "time_s": np.array([10.0, 20.0]),
-    "collisions": np.array([0, 2]),
-    "goals": np.array([4, 6]),
-    "goals_reached": np.array([4, 5]),
-    "information": np.array([5.0, 6.0]),
-    "reason": np.array([1, 2]),
-}
 
 
 def test_more_than_nine_of_ten_looks_make_a_class_unambiguous():

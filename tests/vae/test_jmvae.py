@@ -52,14 +52,6 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     np.testing.assert_allclose(parts["subsets"], [expected], rtol=1e-5)
 
 
-def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
-    params = with_output(zero_parameters(TWO), "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
-    features = keep(looks(TWO), (1,))
-    belief = jmvae.posterior(params, TWO, features)
-    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
-    np.testing.assert_allclose(belief.std, [2.0, 1.0], rtol=1e-6)  # exp(ln(4) / 2) = 2
-
-
 def test_beta_falls_by_equal_factors_to_its_last_value():
     config = JmvaeConfig(steps=100, annealing=0.5, initial_beta=1.0, beta=0.01)
     betas = [float(jmvae.annealed_beta(jnp.int32(s), config)) for s in (0, 25, 50, 99)]
