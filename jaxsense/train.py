@@ -32,8 +32,8 @@ from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import tables, terminal
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import blocks, compare
-from jaxsense.summary.blocks import Header, Made
-from jaxsense.summary.read import read_made, read_summary
+from jaxsense.summary.blocks import Header, Origin
+from jaxsense.summary.read import read_origins, read_summary
 
 PROGRAM = "jaxsense.train"
 
@@ -248,7 +248,8 @@ def _train_one(
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(terminal.tensorboard(run.path / "tensorboard"))
-    if several := compare.several_origins(run.made("mission")):
+    origins = run.sign()
+    if several := compare.several_origins(origins):
         _warn(f"{run.path}: {several}")
     with Display(console, records, quiet=arguments.quiet) as display:
         monitor.begin(display.show)
@@ -258,7 +259,7 @@ def _train_one(
             _warn(f"{error}; earlier checkpoints are in {run.path}")
             return str(error)
         monitor.check_stop()
-        header = _header(run, run.sign("mission"))
+        header = _header(run, origins)
         _write(run, {**header, "timing": monitor.stopwatch.timing(), **results}, pictures)
     return None
 
@@ -282,9 +283,8 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in run.seeds.items() if seed not in failed]
     timing, of_each, means = compare.of_seeds([read_summary(path) for path in paths])
-    made = [(path.name, each) for path in paths for each in read_made(path)]
-    seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
-    header = _header(run, [*seeds_made, *run.made("means")])
+    origins = [each for path in paths for each in read_origins(path)]
+    header = _header(run, [*origins, rundir.process()])
     found: blocks.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
@@ -308,14 +308,15 @@ def _drawing() -> ModuleType:
 _warn = functools.partial(cli.warn, PROGRAM)
 
 
-def _header(run: RunDirectory, made: list[Made]) -> Header:
-    """A summary's keys about the run itself, with what made its stages if that differs."""
+def _header(run: RunDirectory, origins: list[Origin]) -> Header:
+    """A summary's keys about the run itself, with the origins of its results if they differ."""
     found: Header = {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
         **rundir.origin(),
     }
-    return {**found, "origins": made} if compare.differences_of(made) else found
+    different = [each for i, each in enumerate(origins) if each not in origins[:i]]
+    return {**found, "origins": different} if compare.differences_of(different) else found
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:

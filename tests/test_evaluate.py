@@ -197,7 +197,7 @@ def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, PRESETS["smoke"])) as run:
         pass
     line = error_line([str(run.path)], capsys, evaluate)
-    assert "must be a finished run (there is no checkpoint 'detector_camera')" in line
+    assert "detector_camera.msgpack': is missing; must be that of a finished run" in line
 
 
 @pytest.mark.parametrize("program", [evaluate, export])

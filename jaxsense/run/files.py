@@ -7,7 +7,6 @@ import os
 import re
 import secrets
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -157,17 +156,14 @@ class Checkpoints:
         self,
         path: Path,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
-        saved: Callable[[str], object] = lambda name: None,
     ):
         """Opens a directory, which need not exist.
 
         Args:
           path: the directory.
           warn: receives a line about each damaged checkpoint.
-          saved: receives the name of each checkpoint once it is saved.
         """
-        self.path, self._warn, self._saved = path, warn, saved
-        self._lock = threading.Lock()
+        self.path, self._warn = path, warn
 
     def save(self, name: str, tree: PyTree) -> None:
         """Saves a pytree of arrays; raises `OSError` if the file cannot be written."""
@@ -175,10 +171,8 @@ class Checkpoints:
         file.parent.mkdir(parents=True, exist_ok=True)
         content = serialization.msgpack_serialize(serialization.to_state_dict(tree))
         write_digested(file, content)
-        with self._lock:
-            self._saved(name)
 
-    def load(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
+    def load(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree:
         """Loads a checkpoint.
 
         Args:
@@ -187,17 +181,17 @@ class Checkpoints:
           finite: whether all numbers must be finite.
 
         Returns:
-          The tree, with arrays on the host; None if it was not saved.
+          The tree, with arrays on the host.
 
         Raises:
-          ConfigError: if the file is damaged or holds arrays of other shapes.
+          ConfigError: if the file is missing, damaged or holds arrays of other shapes.
         """
         most = _REST + 8 * sum(x.size for x in jax.tree.leaves(shapes))
         try:
             content = without_digest(inside.read(self._file(name), most))
             return _like(shapes, serialization.msgpack_restore(content), finite)
         except FileNotFoundError:
-            return None
+            reason = "is missing; must be that of a finished run"
         except OSError as error:
             reason = f"cannot be read ({error.strerror})"
         except Exception as error:  # the digest may be right and the content of any form
@@ -206,11 +200,12 @@ class Checkpoints:
         raise ConfigError("checkpoint", f"{self.path}/{name}{_SUFFIX}", reason)
 
     def load_or_forget(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
-        """As `load`, but warns and sets the file aside if it cannot be used, and returns None."""
+        """As `load`; None if there is no file, or, with a warning, if it must be set aside."""
+        if not os.path.lexists(file := self._file(name)):
+            return None
         try:
             return self.load(name, shapes, finite)
         except ConfigError as error:
-            file = self._file(name)
             file.replace(file.with_name(f"{file.name}.damaged"))
             self._warn(f"{error}; retraining it")
             return None

@@ -25,9 +25,9 @@ from jaxsense.models import Models
 from jaxsense.run import files, output, version
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.settings import Settings, as_json, began, of_run, read_settings, resumable
-from jaxsense.summary.blocks import Made, Origin
+from jaxsense.summary.blocks import Origin
 from jaxsense.summary.compare import UNKNOWN
-from jaxsense.summary.read import ORIGINS, read_made
+from jaxsense.summary.read import ORIGINS, read_origins
 from jaxsense.tasks.registry import PREFIX, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
@@ -47,8 +47,7 @@ class RunDirectory:
 
     def __init__(self, path: Path, settings: Settings):
         self.path, self.settings = path, settings
-        self.checkpoints = Checkpoints(path / "checkpoints", saved=self.sign)
-        self._made: list[Made] = []
+        self.checkpoints = Checkpoints(path / "checkpoints")
         self._reported: dict[str, int] = {}
 
     @classmethod
@@ -91,9 +90,6 @@ class RunDirectory:
         with _locked(path, "resume"):
             run = cls(path, settings)
             run._remove_partial()
-            run._made = read_made(path)
-            if not run._made and (path / "checkpoints").exists():
-                run._made = [{**UNKNOWN, "stage": "earlier stages"}]
             run._read_metrics()
             yield run
 
@@ -137,18 +133,15 @@ class RunDirectory:
             line = json.dumps({"stage": stage, "step": step, **metrics})
             files.append(self.path / _METRICS, line)
 
-    def made(self, stage: str) -> list[Made]:
-        """What made each stage so far, and this process, which makes another."""
-        mine: Made = {**_process(), "stage": stage}
-        return self._made if mine in self._made else [*self._made, mine]
-
-    def sign(self, checkpoint: str) -> list[Made]:
-        """Writes to `origins.json` that this process made a checkpoint; returns its content."""
-        made = self.made(checkpoint.removeprefix("unfinished/").removeprefix("curves_"))
-        if made != self._made:
-            self._made = made
-            write_json(self.path / ORIGINS, made)
-        return made
+    def sign(self) -> list[Origin]:
+        """Adds this process to `origins.json`, those that have worked on the run; returns all."""
+        found = read_origins(self.path)
+        if not found and (self.path / "checkpoints").exists():
+            found.append(UNKNOWN)
+        if process() not in found[-1:]:
+            found.append(process())
+            write_json(self.path / ORIGINS, found)
+        return found
 
     def _remove_partial(self) -> None:
         """Removes partial files of a killed process; raises `OSError` if a link leads elsewhere."""
@@ -250,11 +243,11 @@ def write_json(path: Path, content: Mapping[str, object] | Sequence[object]) -> 
 
 def origin() -> Origin:
     """How figures of this process are made."""
-    return {**_process(), "date": datetime.now().date().isoformat()}
+    return {**process(), "date": datetime.now().date().isoformat()}
 
 
 @functools.cache
-def _process() -> Origin:
+def process() -> Origin:
     """What is the same for all figures of this process."""
     found: Origin = {
         "versions": version.versions(),
@@ -310,11 +303,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
 
     def restore(name: str, shape: PyTree) -> PyTree:
-        found = checkpoints.load(name, shape, finite=True)
-        if found is None:
-            reason = f"must be a finished run (there is no checkpoint {name!r})"
-            raise ConfigError("run", str(path), reason)
-        return jax.device_put(found)
+        return jax.device_put(checkpoints.load(name, shape, finite=True))
 
     shapes = _named(jax.eval_shape(lambda: models.init(jax.random.key(0), config)), config)
     return config, stages.models({name: restore(name, x) for name, x in shapes.items()}, config)
@@ -353,20 +342,16 @@ def rewards(
     lengths |= {"seconds": epochs // config.dqn.chunk}
     shapes = {name: np.empty(length, np.float32) for name, length in lengths.items()}
 
-    def found(network: str) -> Iterator[dict[str, np.ndarray]]:
-        for directory in (run / "checkpoints" for run in runs):
-            reason = f"{directory}: holds no curves_{network}"
-            try:
-                if curves := Checkpoints(directory).load(f"curves_{network}", shapes):
-                    yield curves
-                    continue
-            except ConfigError as error:
-                reason = str(error)
-            warn(f"{reason}; left out of reward.svg")
+    def found(network: str, run: Path) -> dict[str, np.ndarray] | None:
+        try:
+            return Checkpoints(run / "checkpoints").load(f"curves_{network}", shapes)
+        except ConfigError as error:
+            warn(f"{error}; left out of reward.svg")
+            return None
 
     curves: dict[str, dict[str, np.ndarray]] = {}
     for network in dict.fromkeys(learner(config, name) for name in config.modalities):
-        of_runs = [*found(network)]
+        of_runs = [each for run in runs if (each := found(network, run))]
         curves[network.removeprefix("dqn_")] = {
             name: np.array([each[name] for each in of_runs]).reshape(-1, epochs)
             for name in ("reward", "evaluation")

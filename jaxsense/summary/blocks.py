@@ -244,12 +244,6 @@ class Origin(TypedDict):
     commit: NotRequired[Annotated[str, Metric("commit", "Commit of the source tree.")]]
 
 
-class Made(Origin):
-    """What made a stage of a run, or a part of it."""
-
-    stage: str
-
-
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
@@ -266,7 +260,9 @@ class Header(Origin):
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
-    origins: NotRequired[Annotated[list[Made], Metric("origins", "Of the stages, if several.")]]
+    origins: NotRequired[
+        Annotated[list[Origin], Metric("origins", "Of all, if they differ.")]
+    ]
     seeds: NotRequired[Annotated[dict[str, Results], Metric("seeds", "Results of each seed.")]]
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 

@@ -123,7 +123,7 @@ def differences_of(origins: Sequence[Origin]) -> dict[str, list[str]]:
 
 
 def several_origins(origins: Sequence[Origin]) -> str | None:
-    """Says in what the origins of a run's stages differ; None if they do not."""
+    """Says in what the origins of a run differ; None if they do not."""
     parts = [
         f"{name} {' and '.join(dict.fromkeys(values))}"
         for name, values in differences_of(origins).items()

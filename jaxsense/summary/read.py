@@ -11,7 +11,7 @@ from typing import is_typeddict as is_block
 from jaxsense.config import ConfigError
 from jaxsense.config.options import command, parse_json
 from jaxsense.core import inside
-from jaxsense.summary.blocks import Evaluation, Interval, Made, Missions, Results, Summary, Timed
+from jaxsense.summary.blocks import Evaluation, Interval, Missions, Origin, Results, Summary, Timed
 
 ORIGINS = "origins.json"
 EVALUATIONS = "evaluations"
@@ -43,14 +43,14 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
     return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
 
 
-def read_made(run: Path) -> list[Made]:
-    """What made each stage of a run, which need not be finished; without `origins.json`, nothing.
+def read_origins(run: Path) -> list[Origin]:
+    """The processes that have worked on a run, in order; none without `origins.json`.
 
     Raises:
       ConfigError: if the file cannot be read, or a value in it is missing or wrong.
     """
     file = run / ORIGINS
-    return cast(list[Made], _read(run, file, list[Made])) if file.exists() else []
+    return cast(list[Origin], _read(run, file, list[Origin])) if file.exists() else []
 
 
 def _read(run: Path, file: Path, kind: type) -> object:
