@@ -172,14 +172,10 @@ def _write(
 
 
 def _report(run: Path, config: Config) -> Path:
-    """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
+    """Writes the page of a run; raises `ConfigError` if its figures are wrong."""
     own, found, path = read_summary(run), read_evaluations(run), run / "report.html"
     if own.get("seeds"):
         raise ConfigError("run", str(run), "holds several seeds; choose one")
-    made = [_evaluation(config, own["mission"], own), *found.values()]
-    places = [each for each in made if _is_alike(each)]
-    if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
-        files.write(run / "teams.svg", drawing.svg(plots.places(places)))
     files.write(path, page.render(run, config, own, found))
     return path
 

@@ -19,7 +19,7 @@ import rich.console
 import rich.table
 
 from jaxsense.config import PRESETS, Config, ConfigError
-from jaxsense.config.options import Name, OptionError, command, options_of, split
+from jaxsense.config.options import Name, command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
@@ -156,20 +156,20 @@ def parse(
                 raise ConfigError("resume", resume, reason)
             if arguments.settings != stored:
                 raise ConfigError("resume", resume, "resumes in its own settings; omit others")
-    except (ConfigError, OptionError) as error:
+    except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     return arguments
 
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, needed before those are read."""
-    given, _ = split([*options_of(Arguments)], argv)
-    is_trusted = given.get(("trust",)) is True
-    if isinstance(resume := given.get(("resume",)), Path):
+    values, _ = given(Arguments, argv)
+    is_trusted = values.get("trust") is True
+    if isinstance(resume := values.get("resume"), Path):
         return resumable(resume, is_trusted)
-    if isinstance(file := given.get(("config",)), Path):
+    if isinstance(file := values.get("config"), Path):
         return read_settings(file, is_trusted)
-    preset = str(given.get(("settings", "preset"), "default"))
+    preset = str(values.get("settings.preset", "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     return Settings(preset, 0, change(PRESETS[preset]))

@@ -38,12 +38,12 @@ def parse(
     """
     base = arguments if default is None else default
     if {"-h", "--help", "--help-all"} & set(argv):
-        tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip("\n"))
+        tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip())
         sys.exit(0)
     try:
         require_32_bits()
         return options.read(base, argv)
-    except (ConfigError, options.OptionError) as error:
+    except ConfigError as error:
         fail(program, str(error))
 
 

@@ -1,12 +1,11 @@
 """The plots of a run: latent space, looks, calibration, learning, and policies in missions."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import jax
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
@@ -26,13 +25,11 @@ from jaxsense.show.colours import (
     policy_colour,
     policy_marker,
 )
-from jaxsense.show.tables import counted
 from jaxsense.summary.blocks import (
     AGENTS,
     MISSIONS,
     Agent,
     Beliefs,
-    Evaluation,
     Missions,
     Number,
     mean,
@@ -286,7 +283,10 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
     right.plot(belief["looks"], belief["bayes_nll"], "s--", label="exact Bayes", **style)
     right.set(xlabel="looks", ylabel="NLL of the true class [nats]", yscale="log")
     right.set_xticks(belief["looks"])
-    _number(right.yaxis)
+    # Plain numbers on the logarithmic axis.
+    right.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    right.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    right.yaxis.set_minor_formatter(NullFormatter())
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend(ncols=3, **_ABOVE)
@@ -328,42 +328,3 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
         case {"mean": float(middle), "low": float(low), "high": float(high)}:
             return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
     return None
-
-
-def places(evaluations: Iterable[Evaluation]) -> Figure:
-    """Median time of missions of every policy, a row for each arena and team.
-
-    Args:
-      evaluations: missions; of the same arena and team, those with the most are shown.
-    """
-
-    def size(place: Evaluation) -> float:
-        return max(mean(case["episodes"]) for case in place["mission"].values())
-
-    largest = {_place(each): each for each in sorted(evaluations, key=size)}
-    names = sorted(largest, key=lambda name: (largest[name]["num_pois"], largest[name]["robots"]))
-    figure = Figure(figsize=(10, 1.6 + 0.4 * len(names)), layout="constrained")
-    ax = figure.subplots()
-    played = {name: policies_of(largest[name]["mission"]) for name in names}
-    for policy in dict.fromkeys(policy for each in played.values() for policy in each):
-        rows = [y for y, name in enumerate(names) if policy in played[name]]
-        times = [mean(played[names[y]][policy]["time_s"]) for y in rows]
-        marker, colour = policy_marker(policy), policy_colour(policy)
-        ax.plot(times, rows, marker, color=colour, label=policy, markerfacecolor="none")
-    ax.set_yticks(range(len(names)), names)
-    ax.set(xlabel=MISSIONS["time_s"].label, xscale="log", ylim=(-0.7, len(names) - 0.3))
-    _number(ax.xaxis)
-    ax.grid(alpha=0.3)
-    ax.legend(**_BESIDE)
-    return figure
-
-
-def _place(found: Evaluation) -> str:
-    return f"{found['num_pois']} PoIs in {found['side']:g} m: {counted(found['robots'])}"
-
-
-def _number(axis: Axis) -> None:
-    """Writes plain numbers to a logarithmic axis."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(NullFormatter())

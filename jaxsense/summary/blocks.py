@@ -260,9 +260,7 @@ class Header(Origin):
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
-    origins: NotRequired[
-        Annotated[list[Origin], Metric("origins", "Of all, if they differ.")]
-    ]
+    origins: NotRequired[Annotated[list[Origin], Metric("origins", "Of all, if they differ.")]]
     seeds: NotRequired[Annotated[dict[str, Results], Metric("seeds", "Results of each seed.")]]
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 

@@ -72,7 +72,7 @@ def refusal(main, argv, place, capsys) -> str:
 
 
 TRAIN = [
-    (["--seed"], "argument --seed: expected one argument"),
+    (["--seed"], "option = '--seed': expected one argument"),
     (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
     (
@@ -94,12 +94,15 @@ TRAIN = [
     (["--resume", "full"], "resume = 'full': is not a run directory: it has no config.json"),
     (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),
     (["--team.travel.view-distanc", "1"], "; did you mean --team.travel.view-distance?"),
-    (["--team.num-pois", "3"], "argument --team.num-pois: expected 2 arguments"),
-    (["--mdp.partly-seen-starts", "maybe"], "unexpected argument 'maybe'"),
-    (["--dqn.epoch", "3"], "unknown option --dqn.epoch; did you mean --dqn.epochs?"),
-    (["-=\u202e"], "unknown option -; see"),
-    (["-\u202e"], r"unknown option -\u202e; see"),
-    (["smoke"], "unexpected argument 'smoke'"),
+    (["--team.num-pois", "3"], "option = '--team.num-pois': expected 2 arguments"),
+    (
+        ["--mdp.partly-seen-starts", "maybe"],
+        "option = 'maybe': unexpected argument: options start with --",
+    ),
+    (["--dqn.epoch", "3"], "option = '--dqn.epoch': is unknown; did you mean --dqn.epochs?"),
+    (["-=\u202e"], "option = '-': is unknown; see"),
+    (["-\u202e"], r"option = '-\u202e': is unknown; see"),
+    (["smoke"], "option = 'smoke': unexpected argument"),
 ]
 
 
@@ -122,7 +125,7 @@ OTHERS = [
     (
         evaluate,
         [],
-        "missing argument RUN: the directory of a finished run, e.g. runs/20261123-190025-default",
+        "option = 'RUN': is missing: The directory of a finished run, e.g. runs/20261123-190025-d",
     ),
     (evaluate, ["pretrained:noisy"], "run = 'pretrained:noisy': only names models; must be a"),
     (export, ["noisy"], "run = 'noisy': is not a run directory: it has no config.json"),
