@@ -22,7 +22,7 @@ from jaxsense.run.monitor import Monitor
 _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
-# On a CPU; so many that `evaluate` compiles faster programs, see `ledger.runs_long`.
+# On a CPU; so many that `evaluate` compiles faster programs, see `missions.Player`.
 _OF_CPU, _OF_CPU_OF_MANY = 5632, 1024
 PERIODS_BEFORE = 40
 """Control periods before what is measured under way: 4 s of missions that last 14 s."""

@@ -71,8 +71,7 @@ def main(argv: list[str] | None = None) -> None:
         with rundir.begun(arguments.out, f"demo-{arguments.preset}") as place:
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
                 played = _play(arguments, scenario, models, compiler)
-            metrics = {name: each.metrics[name] for name, each in played.items()}
-            block = make.missions(config, metrics)
+            block = make.missions(config, played.metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"
             text = page.fill(
@@ -100,19 +99,19 @@ def main(argv: list[str] | None = None) -> None:
 
 def _play(
     arguments: Arguments, scenario: mission.Mission, models: Models, compiler: Compiler
-) -> dict[str, Played]:
+) -> Played:
     """A mission of each policy, in the same arena."""
     names = dict.fromkeys((arguments.policy, _REFERENCE))
-    scenario, key = scenario.playing(names), jax.random.key(arguments.seed)
-    player, cases = missions.Player(scenario, compiler, total=1), mission.cases(scenario.config)
-    return {name: player.play(key, models, {name: cases[name]}, episodes=1) for name in names}
+    scenario, cases = scenario.playing(names), mission.cases(scenario.config)
+    player, played = missions.Player(scenario, compiler, len(names)), {n: cases[n] for n in names}
+    return player.play(jax.random.key(arguments.seed), models, played, episodes=1)
 
 
-def _films(scenario: mission.Mission, models: Models, played: dict[str, Played]) -> dict[str, str]:
+def _films(scenario: mission.Mission, models: Models, played: Played) -> dict[str, str]:
     """Animations of the missions, which last equally long."""
-    recordings = {f"{name} policy": each.recording for name, each in played.items()}
+    recordings = {f"{name} policy": each for name, each in played.recordings.items()}
     films = film.draw(scenario.config, recordings, models.fusion, scenario.fields_of_view)
-    return {name: page.drawing(each) for name, each in zip(played, films, strict=True)}
+    return {name: page.drawing(each) for name, each in zip(recordings, films, strict=True)}
 
 
 def _sentence(policy: str) -> str:

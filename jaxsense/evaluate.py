@@ -2,13 +2,11 @@
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import jax
-import numpy as np
 import rich.console
 import rich.table
 
@@ -89,6 +87,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     """
     arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
     console = rich.console.Console()
+    display = Display(console)
     try:
         arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
@@ -102,65 +101,69 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
-        with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
-            number, times = arguments.episodes * len(played), [time.perf_counter()]
+        number = arguments.episodes * len(played)
+        monitor, key = Monitor(display.show), jax.random.key(arguments.seed)
+        with display, Compiler(monitor, kept) as compiler:
             player = missions.Player(scenario, compiler, number, workers)
-            player.wait()
-            times.append(time.perf_counter())
-            key = jax.random.key(arguments.seed)
             found = player.play(key, models, played, arguments.episodes)
-            times.append(time.perf_counter())
-        block = make.missions(config, found.metrics)
-        fields = scenario.fields_of_view
-
-        def draw(title: str) -> str:
-            return film.draw(config, {title: found.recording}, models.fusion, fields)[0]
-
-        written = _write(arguments, trained, config, block, draw)
+        block, written = make.missions(config, found.metrics), []
+        if arguments.animate:
+            (name, recording), *_ = found.recordings.items()
+            title, stem = _film(arguments, trained, config, name)
+            (text,) = film.draw(config, {title: recording}, models.fusion, scenario.fields_of_view)
+            path = arguments.run / f"{stem}.svg"
+            files.write(path, text)
+            written.append(f"The first mission of {name} is in {path}.")
+        written.append(_write(arguments, trained, config, block))
     except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         done = "written" if isinstance(error, files.WriteError) else "used"
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be {done} ({cli.reason(error)})")
     _print(console, block, arguments.episodes)
-    compilation, seconds = np.diff(times)
+    timing = monitor.stopwatch.timing()
+    seconds = timing["stages"]["mission"]["run_s"]
     rate = found.control_steps / seconds
     say(
-        f"{number} missions in {seconds:.1f} s after {compilation:.0f} s of compilation: "
-        f"{rate:.0f} control steps/s, "
-        f"{rate * CONTROL_PERIOD / TIMESTEP:.0f} physics steps/s"
+        f"{number} missions in {seconds:.1f} s after {timing['total_s'] - seconds:.0f} s of "
+        f"compilation: {rate:.0f} control steps/s, {rate * CONTROL_PERIOD / TIMESTEP:.0f} physics "
+        "steps/s"
     )
     for line in written:
         say(line)
 
 
-def _write(
-    arguments: Arguments,
-    trained: Config,
-    config: Config,
-    missions: blocks.Missions,
-    draw: Callable[[str], str],
-) -> list[str]:
-    """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
-    run, written = arguments.run, []
-    if arguments.animate:
-        name, elsewhere = next(iter(missions)), f"-{_place(config)}"
-        title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
-        if config == trained:
-            title, elsewhere = f"{name} policy, seed {arguments.seed}", ""
-        path = run / f"mission-{name}-{arguments.seed}{elsewhere}.svg"
-        files.write(path, draw(title))
-        written.append(f"The first mission of {name} is in {path}.")
+def _film(arguments: Arguments, trained: Config, config: Config, name: str) -> tuple[str, str]:
+    """Title of the film of a case, and the name of its file."""
+    stem = f"mission-{name}-{arguments.seed}"
+    if config == trained:
+        return f"{name} policy, seed {arguments.seed}", stem
+    title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
+    return title, f"{stem}-{_place(config)}"
+
+
+def _write(arguments: Arguments, trained: Config, config: Config, missions: blocks.Missions) -> str:
+    """Writes an evaluation and the run's page; returns a line about them."""
+    run, origin = arguments.run, rundir.origin()
     for case in missions.values():
         case["seed"] = arguments.seed
     stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
     with files.locked(run, on_wait=say):
         # Another policy may have played in the same arenas before; by other code, it stands apart.
         others = read_evaluations(run)
+        apart = {
+            name: compare.differences_of([other.get("origin", compare.UNKNOWN), origin])
+            for name, other in others.items()
+        }
         names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
-        name = next(name for name in names if name not in others or _is_alike(others[name]))
-        merged = {**(others[name]["mission"] if name in others else {}), **missions}
-        found = _evaluation(config, merged, rundir.origin())
+        name = next(name for name in names if not apart.get(name))
+        found: blocks.Evaluation = {
+            "num_pois": config.arena.num_pois,
+            "side": config.arena.side,
+            "robots": list(config.carried),
+            "origin": origin,
+            "mission": {**(others[name]["mission"] if name in others else {}), **missions},
+        }
         path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
@@ -168,7 +171,7 @@ def _write(
             plot = plots.policies(found["mission"])
             files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
-    return [*written, f"The metrics are in {path}, and with all others in {report}."]
+    return f"The metrics are in {path}, and with all others in {report}."
 
 
 def _report(run: Path, config: Config) -> Path:
@@ -178,25 +181,6 @@ def _report(run: Path, config: Config) -> Path:
         raise ConfigError("run", str(run), "holds several seeds; choose one")
     files.write(path, page.render(run, config, own, found))
     return path
-
-
-def _evaluation(
-    config: Config, missions: blocks.Missions, origin: blocks.Origin
-) -> blocks.Evaluation:
-    """Missions with their arena, their team and what made them."""
-    arena = config.arena
-    return {
-        "num_pois": arena.num_pois,
-        "side": arena.side,
-        "robots": list(config.carried),
-        "origin": origin,
-        "mission": missions,
-    }
-
-
-def _is_alike(found: blocks.Evaluation) -> bool:
-    """Whether missions were made as this process makes them, be it on another day."""
-    return not compare.differences_of([found.get("origin", compare.UNKNOWN), rundir.origin()])
 
 
 def _place(config: Config) -> str:

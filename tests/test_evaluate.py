@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import jax
 import pytest
-from recordings import FIELDS_OF_VIEW, recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
@@ -21,7 +20,6 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import rundir
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.show import film
 
 
 @pytest.fixture(scope="module")
@@ -69,12 +67,8 @@ def copy(evaluated, tmp_path):
 
 
 def write(arguments, missions):
-    config, models = jaxsense.load(arguments.run)
-
-    def draw(title):
-        return film.draw(config, {title: recording()}, models.fusion, FIELDS_OF_VIEW)[0]
-
-    return evaluate._write(arguments, config, config, missions, draw)
+    config, _ = jaxsense.load(arguments.run)
+    return evaluate._write(arguments, config, config, missions)
 
 
 def only(blocks, *names):

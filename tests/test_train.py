@@ -68,10 +68,12 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     monkeypatch.setattr(drawing.film, "draw", draw)
     monkeypatch.setattr(drawing.plots, "policies", lambda block: Figure())
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
-    for naive, films in ((None, ["mission.svg"]), ("other", ["mission.svg", "mission-naive.svg"])):
-        played = SimpleNamespace(recording="own", naive=naive)
+    own = {"naive_2": "own"}
+    films = ["mission.svg", "mission-naive.svg"]
+    for recordings in (own, {**own, "naive": "other"}):
+        played = SimpleNamespace(recordings=recordings)
         found = drawing.of_missions(config, learned, played, {})  # pyright: ignore
-        assert [*found] == ["policies.svg", *films]
+        assert [*found] == ["policies.svg", *films[: len(recordings)]]
     own = {"naive_2 policy": "own"}
     assert drawn == [own, {**own, "naive policy": "other"}]
 

@@ -181,11 +181,6 @@ def put(values: PyTree, place: NamedSharding) -> PyTree[jax.Array]:
     return jax.tree.map(put_one, values)
 
 
-def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
-    """Puts values, the same in every process, on every device of a mesh, or on the one device."""
-    return jax.device_put(values) if mesh is None else put(values, places(mesh, 1, whole=1)[0])
-
-
 def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
     """Values of all devices on the host, in every process."""
     if jax.process_count() > 1:

@@ -54,9 +54,7 @@ def of_training(config: Config, learned: Learned) -> Pictures:
 
 def of_missions(config: Config, learned: Learned, played: Played, block: Missions) -> Pictures:
     """The plot of missions and the film of one, also under naive exploration."""
-    missions = {f"{config.mission.policies[0]} policy": played.recording}
-    if played.naive is not None:
-        missions["naive policy"] = played.naive
+    missions = {f"{name} policy": each for name, each in played.recordings.items()}
     films = film.draw(config, missions, learned.models.fusion, learned.fields_of_view)
     names = (f"{name}.svg" for name in page.OWN_FILMS)
     return {
