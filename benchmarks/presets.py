@@ -4,7 +4,6 @@ Cells are ranges over the seeds of a preset.
 """
 
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -144,7 +143,7 @@ class Arguments:
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     try:
         require(bool(arguments.runs), arguments, "runs", "must be at least one directory")
         print(table(map(read_summary, arguments.runs)))

@@ -59,7 +59,7 @@ def main(argv: list[str] | None = None) -> None:
     Args:
       argv: the command line without the program; by default the process's own.
     """
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
     try:
         devices.start(1)

@@ -1,7 +1,6 @@
 """`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
 import dataclasses
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -85,7 +84,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
       argv: the command line without the program; by default the process's own.
       policies: custom policies by name, to play in addition to `dqn.POLICIES`.
     """
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
     display = Display(console)
     try:

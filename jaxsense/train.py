@@ -22,7 +22,7 @@ from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import Name, command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
-from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
+from jaxsense.run import cli, devices, files, output, pipeline, rundir
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.output import on_interrupt, say
@@ -104,14 +104,14 @@ def main(
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
             run.check_seeds()
-            processes.join(
+            devices.join(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
                 quiet=is_quiet,
             )
             _train(arguments, run, monitor, console, policies)
-        processes.leave()
+        devices.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -143,7 +143,7 @@ def parse(
     """
     try:
         stored = _stored(argv, change)
-        arguments = cli.parse(PROGRAM, Arguments, argv, Arguments(stored), _COMMON)
+        arguments = cli.parse(PROGRAM, Arguments(stored), argv, _COMMON)
         require_playable(arguments.settings.config, policies)
         if arguments.tensorboard:
             terminal.require_tensorboard()
@@ -201,7 +201,7 @@ def _train(
     workers = devices.start(arguments.devices)
     kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
     is_left = np.array([not (path / "summary.json").exists() for path in run.seeds.values()])
-    left = [*itertools.compress(run.seeds.items(), processes.of_first_process(is_left))]
+    left = [*itertools.compress(run.seeds.items(), devices.of_first_process(is_left))]
 
     def stop() -> None:
         monitor.stop()
@@ -233,7 +233,7 @@ def _end_stopped(run: RunDirectory) -> NoReturn:
         again += " with the same processes" if jax.process_count() > 1 else ""
         output.complain(f"Stopped; all training so far is saved. To resume: {again}")
     # Other processes may be blocked in a collective; wait only briefly.
-    processes.leave(processes.LEAVE_TIMEOUT)
+    devices.leave(devices.LEAVE_TIMEOUT)
     sys.exit(output.INTERRUPTED)
 
 

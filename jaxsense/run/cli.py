@@ -20,23 +20,16 @@ CACHE = (_CACHES if _CACHES.is_absolute() else Path("~/.cache")) / "jaxsense"
 """Where compiled programs are kept for later calls."""
 
 
-def parse(
-    program: str,
-    arguments: type[T],
-    argv: list[str],
-    default: T | None = None,
-    common: Sequence[str] = (),
-) -> T:
+def parse(program: str, base: T | type[T], argv: list[str] | None, common: Sequence[str] = ()) -> T:
     """Reads a command line; ends the program after printing the help or an error.
 
     Args:
       program: module to run, for example "jaxsense.train".
-      arguments: dataclass of the options, which checks their values.
-      argv: the command line without the program.
-      default: values of missing options; those of the class by default.
+      base: dataclass of the options; an instance, or else the class, holds their defaults.
+      argv: the command line without the program; by default the process's own.
       common: options that `--help` shows, in this order; all by default.
     """
-    base = arguments if default is None else default
+    argv = sys.argv[1:] if argv is None else argv
     if {"-h", "--help", "--help-all"} & set(argv):
         tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip())
         sys.exit(0)

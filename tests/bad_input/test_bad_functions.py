@@ -185,7 +185,7 @@ FUNCTIONS = [
         "models.fusion = int: must be a Fusion; it lacks accumulates, classes, prior, update",
     ),
     (lambda w: of_missions(w, policies={3: values}), "policies = {3: <function values"),
-    (lambda w: of_missions(w, policies={"mine": 3}), "policies = 'mine': must be a function or"),
+    (lambda w: of_missions(w, policies={"mine": 3}), "policies['mine'] = 3: must be a function"),
     (lambda w: of_missions(w, policies={"mine": nop}), "policies['mine'] = nop"),
     (lambda w: of_missions(w, policies={"a_blind": values}), "policies = 'a_blind'"),
     (lambda w: of_missions(w, changed("arena", num_pois=2)), "arena.num_pois = 2: must be the num"),

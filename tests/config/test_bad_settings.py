@@ -156,14 +156,14 @@ CHANGES = [
     ({"sensors": {1: SensorConfig("a:b", "shape")}}, "must be a dictionary from names"),
     ({"sensors": {"": SensorConfig("a:b", "shape")}}, "sensors = '': must be a word of 1 to 64"),
     ({"sensors": {"x" * 65: SensorConfig("a:b", "shape")}}, "must be a word of 1 to 64"),
-    ({"arena.classes": ("red cube",)}, "must be a list of 2 or more texts"),
+    ({"arena.classes": ("red cube",)}, "must be a list of 2 or more values, each text"),
     ({"arena.classes": ("red  cube", "red cylinder")}, "'red  cube' must be"),
     ({"arena.classes": ("red cube", "red cube")}, "must name no class twice"),
     (
         {"arena.colours": TWINS, "arena.classes": ("red cube", "crimson cube")},
         "no sensor can distinguish",
     ),
-    ({"arena.colours": {"red": (1.0, 0.0)}}, "lists of 3 numbers, each from 0 to 1"),
+    ({"arena.colours": {"red": (1.0, 0.0)}}, "each a list of 3 values, each a number, from 0 to 1"),
     (
         {"arena.num_pois": 26},
         "arena.num_pois = 26: must be at most 25: no more PoIs of radius 0.1 m with gaps of 0.3 m "
@@ -296,7 +296,7 @@ HEAT = Attribute({"hot": 60.0, "cold": 5.0})
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: Shape("box", (0.5,)), "shape.half_sides = (0.5,): must be a list of 2 numbers"),  # pyright: ignore
+        (lambda: Shape("box", (0.5,)), "shape.half_sides = (0.5,): must be a list of 2 values"),  # pyright: ignore
         (lambda: Shape("cylinder", (1.0, 0.5)), "must be the same number twice for a cylinder"),
         (lambda: Attribute({"hot": "x"}), "attribute.values = {'hot': 'x'}: must be a dictionary"),  # pyright: ignore
         (lambda: Attribute({}), "must name one or more"),

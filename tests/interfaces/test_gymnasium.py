@@ -147,13 +147,13 @@ def test_pictures_show_what_changes():
         envs.render()
     envs.reset(seed=3)
     before = envs.render()
-    assert [(x.shape, x.dtype) for x in before] == [((400, 800, 3), np.uint8)] * 2
+    assert [(x.shape, x.dtype) for x in before] == [((400, 400, 3), np.uint8)] * 2
     envs.step(np.array([0, NOP]))  # the second episode ends
     after = envs.render()
     assert all(np.any(x != y) for x, y in zip(before, after, strict=True))
     env = gymnasium.make("jaxsense/map-v0", render_mode="rgb_array")
     env.reset(seed=3)
-    assert env.render().shape == (400, 800, 3)
+    assert env.render().shape == (400, 400, 3)
     assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
 
 
