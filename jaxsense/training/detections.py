@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense import looks
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import FitState
+from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.models import make_bayes, make_detector
 from jaxsense.sim import sensors
@@ -159,10 +159,10 @@ def detector_stage(
         surveys: Surveys,
         examples: tuple[Looks, ...],
         **_: Output,
-    ) -> detectors.Fitting:
+    ) -> Problem[Output]:
         shown, labels = jax.tree.map(lambda x: x[:number], labelled(surveys))
         nothing = _divided(examples[modality])[1]
-        return detectors.Fitting(config.detector, detector, shown, labels, nothing)
+        return detectors.problem(config.detector, detector, shown, labels, nothing)
 
     def trained(
         config: Config,

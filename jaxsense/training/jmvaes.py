@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from jaxsense.config import Config
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.training import measures
 from jaxsense.training.detections import Detections
-from jaxsense.training.stage import Stage, fit_stage
+from jaxsense.training.stage import Output, Stage, fit_stage
 from jaxsense.vae import fusion, jmvae
-from jaxsense.vae.fusion import Decoding, Filter, Filtering, InPlace
+from jaxsense.vae.fusion import Filter, InPlace
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 
@@ -65,7 +66,7 @@ def fit_in_place(
 ) -> InPlace:
     """Fusion in place, with decoders that have learned to decode beliefs."""
     settings = dataclasses.replace(config.jmvae, steps=-(-config.jmvae.steps // 3))
-    problem = Decoding(settings, detections.bank, make_jmvae(config), params)
+    problem = fusion.decoding(settings, detections.bank, make_jmvae(config), params)
     start = supervised.start(params["decoders"], settings)
     fit, _ = supervised.fit(key, start, problem, settings.steps)
     return make_in_place(config, {**params, "decoders": fit.params}, classes)
@@ -83,9 +84,9 @@ def filter_stage(config: Config) -> Stage:
 
     def problem(
         config: Config, fitted: Filter, *, classes: Belief, detections: Detections
-    ) -> Filtering:
+    ) -> Problem[Output]:
         del classes
-        return Filtering(config.filter, fitted, detections.bank)
+        return fusion.filtering(config.filter, fitted, detections.bank)
 
     return fit_stage(
         "filter",

@@ -13,7 +13,6 @@ from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitConfig, FitState, Problem
 from jaxsense.core.types import Key, pytree
-from jaxsense.vae import jmvae, leave_one_out
 
 _MAX_CHUNKS = 20
 
@@ -132,14 +131,21 @@ def fit_stage(
 
 
 def restarts(
-    config: Config, problem: Callable[..., jmvae.Fitting | leave_one_out.Fitting]
+    config: Config,
+    init: Callable[[Key, Config], Params],
+    problem: Callable[..., Problem[Output]],
 ) -> list[Stage]:
-    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk."""
+    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk.
+
+    Args:
+      init: `(key, config) -> params` to start from.
+      problem: `(config, **inputs) -> Problem`.
+    """
     number = config.jmvae.restarts
     stage = fit_stage(
         "",
         config.jmvae,
-        untrained=lambda key, config, **inputs: ((), problem(config, **inputs).init(key)),
+        untrained=lambda key, config, **inputs: ((), init(key, config)),
         problem=lambda config, _, **inputs: problem(config, **inputs),
         trained=lambda config, _, fit, **inputs: (fit.params, fit.loss),
     )

@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool
 
 from jaxsense.config import Config
 from jaxsense.core import checks
+from jaxsense.core.networks import Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Key, pytree
 from jaxsense.models import Models, make_jmvae, make_models, make_scan_jmvae, orders_looks
 from jaxsense.sim.arena import Arena
@@ -94,14 +96,17 @@ def _learn_from_detections(
     """Detectors, parameters of the JMVAE, class beliefs and detections; see `scans`."""
     del scenes
 
-    def problem(config: Config, *, detections: Detections) -> jmvae.Fitting:
-        return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
+    def init(key: Key, config: Config) -> Params:
+        return jmvae.init(key, make_jmvae(config))
+
+    def problem(config: Config, *, detections: Detections) -> Problem[Output]:
+        return jmvae.problem(config.jmvae, detections.bank, make_jmvae(config))
 
     given = {"surveys": surveys, "examples": examples}
     stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
     trained = tuple(drive(stage, **given) for stage in stages)
     detected = drive(Stage("detections", detections.detect), surveys=surveys, trained=trained)
-    each = tuple(drive(stage, detections=detected) for stage in restarts(config, problem))
+    each = tuple(drive(stage, detections=detected) for stage in restarts(config, init, problem))
     choose = Stage("best_jmvae", jmvaes.best)
     params = drive(choose, restarts=each, detections=detected)
     average = Stage("class_beliefs", jmvaes.class_beliefs)
@@ -115,11 +120,14 @@ def _learn_from_scans(
 ) -> tuple[Output, Output, Output, Output]:
     """The same of a JMVAE that learns from scans, and whose encoders serve as detectors."""
 
-    def problem(config: Config, *, views: Views) -> leave_one_out.Fitting:
-        return leave_one_out.Fitting(config.jmvae, views.groups, make_scan_jmvae(config))
+    def init(key: Key, config: Config) -> Params:
+        return leave_one_out.init(key, make_scan_jmvae(config))
+
+    def problem(config: Config, *, views: Views) -> Problem[Output]:
+        return leave_one_out.problem(config.jmvae, views.groups, make_scan_jmvae(config))
 
     seen = drive(Stage("views", scans.views), surveys=surveys)
-    each = tuple(drive(stage, views=seen) for stage in restarts(config, problem))
+    each = tuple(drive(stage, views=seen) for stage in restarts(config, init, problem))
     params = drive(Stage("best_jmvae", jmvaes.best), restarts=each)
     learned = {"params": params, "views": seen, "surveys": surveys}
     classes = drive(Stage("class_beliefs", scans.class_beliefs), **learned)

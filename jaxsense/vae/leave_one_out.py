@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import JmvaeConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Belief, Key, product, pytree
 from jaxsense.vae import detectors, gaussian
 from jaxsense.vae.detectors import Classifier
@@ -142,42 +143,32 @@ def losses(
     return total + draws(*_of_means(params, model, found))
 
 
-@pytree
-class Fitting:
-    """Problem of fitting the JMVAE to groups of looks, each sensor's in its frame."""
+def problem(config: JmvaeConfig, groups: Groups, model: Jmvae) -> Problem[Drawn]:
+    """The fit of the JMVAE to groups of looks, each sensor's in its frame."""
 
-    config: JmvaeConfig
-    groups: Groups
-    model: Jmvae = struct.field(pytree_node=False)
-
-    def init(self, key: Key) -> Params:
-        """Random parameters to start from."""
-        return init(key, self.model)
-
-    def draw(self, key: Key, number: int) -> Drawn:
-        """PoIs and noise, see `Problem.draw`."""
+    def draw(key: Key, number: int) -> Drawn:
         row_key, noise_key = jax.random.split(key)
-        batch, looks = self.config.batch, self.groups[0].shape[1]
-        rows = jax.random.randint(row_key, (number, batch), 0, len(self.groups[0]))
-        size = (number, len(self.groups), self.model.latent_size, batch, looks)
+        batch, looks = config.batch, groups[0].shape[1]
+        rows = jax.random.randint(row_key, (number, batch), 0, len(groups[0]))
+        size = (number, len(groups), model.latent_size, batch, looks)
         return rows, jax.random.normal(noise_key, size)
 
-    def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses` of a batch; the step determines alpha and beta."""
+    def loss(params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
         rows, noise = drawn
-        share = step / self.config.steps
-        has_begun = jnp.clip((share - _ALPHA_START) / _ALPHA_RAMP, 0.0, 1.0)
+        share = step / config.steps
         of_each = losses(
             noise,
             params,
-            self.model,
-            tuple(x[rows] for x in self.groups),
-            alpha=self.config.alpha,
-            beta=annealed_beta(step, self.config),
-            has_begun=has_begun,
-            reconstruction_weights=self.config.reconstruction_weights,
+            model,
+            tuple(x[rows] for x in groups),
+            alpha=config.alpha,
+            beta=annealed_beta(step, config),
+            has_begun=jnp.clip((share - _ALPHA_START) / _ALPHA_RAMP, 0.0, 1.0),
+            reconstruction_weights=config.reconstruction_weights,
         )
         return jnp.mean(of_each)
+
+    return Problem(config, draw, loss)
 
 
 @pytree

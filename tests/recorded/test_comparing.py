@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS, ConfigError
-from jaxsense.recorded import RecordedLooks, comparing
+from jaxsense.recorded import RecordedLooks
+from jaxsense.recorded import looks as comparing
 
 SMOKE = PRESETS["smoke"]
 CUBE = 2

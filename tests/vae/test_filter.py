@@ -108,7 +108,7 @@ TRAINED = FilterConfig(steps=600)
 def trained():
     """A filter after two chunks of half its training, and all losses."""
     found = untrained((16,))
-    problem = fusion.Filtering(TRAINED, found, bank(jax.random.key(2), 4000))
+    problem = fusion.filtering(TRAINED, found, bank(jax.random.key(2), 4000))
     train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
     state, losses = supervised.start(found.networks, TRAINED), []
     for i in range(2):

@@ -62,7 +62,7 @@ def test_several_sensors_may_look_at_once():
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
     params, shown = random_params(jmvae.init, TWO), looks(TWO)
     config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))
-    problem = fusion.Decoding(config, tuple(x[None, None] for x in shown), TWO, params)
+    problem = fusion.decoding(config, tuple(x[None, None] for x in shown), TWO, params)
     drawn = jnp.zeros((2, 1)), tuple(x[:, None] for x in shown)
     found = jax.jit(problem.loss)(params["decoders"], drawn, jnp.int32(0))
     expected = 0.0

@@ -70,7 +70,7 @@ LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
 
 @pytest.fixture(scope="module")
 def drawn():
-    return jmvae.Fitting(
+    return jmvae.problem(
         SETTINGS, (CAMERA, LIDAR), Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
     ).draw(jax.random.key(0), 20)
 

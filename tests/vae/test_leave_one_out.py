@@ -122,7 +122,7 @@ def test_alpha_sets_in_late():
     config = JmvaeConfig(
         learns_from="scans", fusion="filter", hidden=(4,), steps=100, alpha=3.0, annealing=0.0,
     )  # fmt: skip
-    problem = leave_one_out.Fitting(config, LOOKS, MODEL)
+    problem = leave_one_out.problem(config, LOOKS, MODEL)
     rows, noise = problem.draw(KEY, 1)
     drawn, loss = (rows[0], noise[0]), jax.jit(problem.loss)
     early, start, late, end = (
