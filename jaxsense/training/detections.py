@@ -5,6 +5,7 @@ Those are detections, and how much of a repeated look is new.
 
 import dataclasses
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training.stage import Output, Stage, fit_stage
+from jaxsense.training.stage import Fit, Output, Stage, fit_stage
 from jaxsense.training.surveys import (
     Scenes,
     Surveys,
@@ -32,6 +33,8 @@ from jaxsense.training.surveys import (
 from jaxsense.vae import detectors, novelty
 from jaxsense.vae.detectors import Classifier, Detector, Looks
 from jaxsense.vae.novelty import Novelty
+
+T = TypeVar("T")
 
 _NUM_CHECKS = 8192  # the most looks of each kind that set a threshold
 _SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
@@ -96,7 +99,7 @@ def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Loo
     def of_modality(key: Key, m: int, sensor: Sensor) -> Looks:
         keys = jax.random.split(key, 5)
         lost_key, share_key, level_key, distance_key, order_key = keys
-        shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], surveys.training.looks(m))
+        shown, _ = _divided(surveys.training.looks(m), _SPOILT_EACH)
         windows, distances = shown.windows, shown.distances
         number = windows.shape[:1]
         blind = jnp.minimum(sensor.blind, sensor.window_limit)
@@ -139,63 +142,38 @@ def detector_stage(
     number, reads_scans = num_training(config), config.jmvae.reads_scans
     of_class = config.label_of_class(config.modalities[modality])
 
-    def labelled(surveys: Surveys) -> tuple[Looks, Int[Array, " S"]]:
-        """Looks at PoIs, and their labels."""
+    def fit(
+        config: Config, *, surveys: Surveys, examples: tuple[Looks, ...], **given: Output
+    ) -> Fit:
         classes = surveys.training.classes.reshape(-1)
         labels = jnp.zeros_like(classes) if reads_scans else jnp.array(of_class)[classes]
-        return surveys.training.looks(modality), labels
+        to_train, held_out = _divided((surveys.training.looks(modality), labels), number)
+        nothing = examples[modality]
+        few_of_nothing, nothing = _divided(nothing, min(len(nothing.distances) // 4, _NUM_CHECKS))
 
-    def untrained(
-        key: Key, config: Config, *, surveys: Surveys, **_: Output
-    ) -> tuple[Classifier, Params]:
-        windows = surveys.training.looks(modality).windows[:number]
-        detector = make_detector(key, config, modality, windows)
-        return detector, detector.params
+        def untrained(key: Key) -> tuple[Classifier, Params]:
+            detector = make_detector(key, config, modality, to_train[0].windows)
+            return detector, detector.params
 
-    def problem(
-        config: Config,
-        detector: Classifier,
-        *,
-        surveys: Surveys,
-        examples: tuple[Looks, ...],
-        **_: Output,
-    ) -> Problem[Output]:
-        shown, labels = jax.tree.map(lambda x: x[:number], labelled(surveys))
-        nothing = _divided(examples[modality])[1]
-        return detectors.problem(config.detector, detector, shown, labels, nothing)
+        def problem(detector: Classifier) -> Problem[Output]:
+            return detectors.problem(config.detector, detector, *to_train, nothing)
 
-    def trained(
-        config: Config,
-        detector: Classifier,
-        fit: FitState,
-        *,
-        surveys: Surveys,
-        examples: tuple[Looks, ...],
-        **given: Output,
-    ) -> Detector:
-        found = dataclasses.replace(detector, params=fit.params)
-        others, labels = jax.tree.map(lambda x: x[number:], labelled(surveys))
-        if len(labels) and not reads_scans:
-            found = detectors.calibrate(found, others, labels)
-        bank = surveys.others.of_scenes(slice(num_scenes(config)[1])).looks(modality)
-        shown = jax.tree.map(lambda x: x[:_NUM_CHECKS], bank)
-        found = detectors.fitted(found, shown, _divided(examples[modality])[0])
-        return finish(config, found, surveys=surveys, **given)
+        def trained(detector: Classifier, fit: FitState) -> Detector:
+            found = dataclasses.replace(detector, params=fit.params)
+            if len(held_out[1]) and not reads_scans:
+                found = detectors.calibrate(found, *held_out)
+            bank = surveys.others.of_scenes(slice(num_scenes(config)[1])).looks(modality)
+            found = detectors.fitted(found, _divided(bank, _NUM_CHECKS)[0], few_of_nothing)
+            return finish(config, found, surveys=surveys, **given)
 
-    return fit_stage(
-        f"detector_{config.modalities[modality]}",
-        config.detector,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-    )
+        return Fit(untrained, problem, trained)
+
+    return fit_stage(f"detector_{config.modalities[modality]}", config.detector, fit)
 
 
-def _divided(nothing: Looks) -> tuple[Looks, Looks]:
-    """Looks at nothing that set the threshold, and those that train the detector."""
-    number = min(len(nothing.distances) // 4, _NUM_CHECKS)
-    first, rest = slice(number), slice(number, None)
-    return jax.tree.map(lambda x: x[first], nothing), jax.tree.map(lambda x: x[rest], nothing)
+def _divided(rows: T, number: int) -> tuple[T, T]:
+    """The first rows, and the rest."""
+    return jax.tree.map(lambda x: x[:number], rows), jax.tree.map(lambda x: x[number:], rows)
 
 
 def detect(

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from jaxsense.config import Config
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.training import measures
 from jaxsense.training.detections import Detections
-from jaxsense.training.stage import Output, Stage, fit_stage
+from jaxsense.training.stage import Fit, Stage, fit_stage
 from jaxsense.vae import fusion, jmvae
 from jaxsense.vae.fusion import Filter, InPlace
 
@@ -75,25 +74,15 @@ def fit_in_place(
 def filter_stage(config: Config) -> Stage:
     """Makes the stage that trains a filter on histories of looks."""
 
-    def untrained(
-        key: Key, config: Config, *, classes: Belief, detections: Detections
-    ) -> tuple[Filter, Params]:
-        del detections
-        found = fusion.init_filter(key, make_jmvae(config), classes, make_prior(config))
-        return found, found.networks
+    def fit(config: Config, *, classes: Belief, detections: Detections) -> Fit:
+        def untrained(key: Key) -> tuple[Filter, Params]:
+            found = fusion.init_filter(key, make_jmvae(config), classes, make_prior(config))
+            return found, found.networks
 
-    def problem(
-        config: Config, fitted: Filter, *, classes: Belief, detections: Detections
-    ) -> Problem[Output]:
-        del classes
-        return fusion.filtering(config.filter, fitted, detections.bank)
+        return Fit(
+            untrained,
+            lambda found: fusion.filtering(config.filter, found, detections.bank),
+            lambda found, fit: dataclasses.replace(found, networks=fit.params),
+        )
 
-    return fit_stage(
-        "filter",
-        config.filter,
-        untrained=untrained,
-        problem=problem,
-        trained=lambda config, fitted, fit, **inputs: dataclasses.replace(
-            fitted, networks=fit.params
-        ),
-    )
+    return fit_stage("filter", config.filter, fit)

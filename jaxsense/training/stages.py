@@ -6,7 +6,7 @@ and stops if asked to.
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
@@ -33,6 +33,9 @@ from jaxsense.training.stage import (
     scan,
 )
 from jaxsense.vae import jmvae, leave_one_out
+
+Init = Callable[[Key], Params]
+"""Draws parameters to start from."""
 
 
 @pytree
@@ -96,17 +99,16 @@ def _learn_from_detections(
     """Detectors, parameters of the JMVAE, class beliefs and detections; see `scans`."""
     del scenes
 
-    def init(key: Key, config: Config) -> Params:
-        return jmvae.init(key, make_jmvae(config))
-
-    def problem(config: Config, *, detections: Detections) -> Problem[Output]:
-        return jmvae.problem(config.jmvae, detections.bank, make_jmvae(config))
+    def start(config: Config, *, detections: Detections) -> tuple[Init, Problem[Output]]:
+        model = make_jmvae(config)
+        problem = jmvae.problem(config.jmvae, detections.bank, model)
+        return functools.partial(jmvae.init, model=model), problem
 
     given = {"surveys": surveys, "examples": examples}
     stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
     trained = tuple(drive(stage, **given) for stage in stages)
     detected = drive(Stage("detections", detections.detect), surveys=surveys, trained=trained)
-    each = tuple(drive(stage, detections=detected) for stage in restarts(config, init, problem))
+    each = tuple(drive(stage, detections=detected) for stage in restarts(config, start))
     choose = Stage("best_jmvae", jmvaes.best)
     params = drive(choose, restarts=each, detections=detected)
     average = Stage("class_beliefs", jmvaes.class_beliefs)
@@ -120,14 +122,13 @@ def _learn_from_scans(
 ) -> tuple[Output, Output, Output, Output]:
     """The same of a JMVAE that learns from scans, and whose encoders serve as detectors."""
 
-    def init(key: Key, config: Config) -> Params:
-        return leave_one_out.init(key, make_scan_jmvae(config))
-
-    def problem(config: Config, *, views: Views) -> Problem[Output]:
-        return leave_one_out.problem(config.jmvae, views.groups, make_scan_jmvae(config))
+    def start(config: Config, *, views: Views) -> tuple[Init, Problem[Output]]:
+        model = make_scan_jmvae(config)
+        problem = leave_one_out.problem(config.jmvae, views.groups, model)
+        return functools.partial(leave_one_out.init, model=model), problem
 
     seen = drive(Stage("views", scans.views), surveys=surveys)
-    each = tuple(drive(stage, views=seen) for stage in restarts(config, init, problem))
+    each = tuple(drive(stage, views=seen) for stage in restarts(config, start))
     params = drive(Stage("best_jmvae", jmvaes.best), restarts=each)
     learned = {"params": params, "views": seen, "surveys": surveys}
     classes = drive(Stage("class_beliefs", scans.class_beliefs), **learned)

@@ -10,6 +10,7 @@ so it takes any number of looks by each sensor in any order.
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -45,18 +46,16 @@ def init(key: Key, model: Jmvae) -> Params:
     number = len(model.modalities)
     joint_key, *keys = jax.random.split(key, 1 + 3 * number)
 
-    def of_each(keys: list[Key], network: MLP) -> Params:
-        each = zip(model.modalities, keys, model.feature_sizes, strict=True)
-        return {name: networks.init(key, network, size) for name, key, size in each}
+    def of_each(first: int, network: Callable[[int], MLP], sizes: Sequence[int]) -> Params:
+        return {
+            name: networks.init(keys[first * number + m], network(m), sizes[m])
+            for m, name in enumerate(model.modalities)
+        }
 
-    decoders = {
-        name: networks.init(keys[2 * number + m], model.decoder(m), model.latent_size)
-        for m, name in enumerate(model.modalities)
-    }
     return {
-        "encoders": of_each(keys[:number], model.encoder),
-        "embeddings": of_each(keys[number : 2 * number], _embedding(model)),
-        "decoders": decoders,
+        "encoders": of_each(0, lambda _: model.encoder, model.feature_sizes),
+        "embeddings": of_each(1, lambda _: _embedding(model), model.feature_sizes),
+        "decoders": of_each(2, model.decoder, [model.latent_size] * number),
         "joint": networks.init(joint_key, _joint(model), number * _EMBEDDING),
     }
 

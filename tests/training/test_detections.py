@@ -6,7 +6,7 @@ from typing import Any, cast
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, TINY, stage_of
+from tiny import KEY, TINY, given_problem, stage_of
 
 from jaxsense.core import supervised
 from jaxsense.training.surveys import Survey, Surveys
@@ -49,6 +49,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
         return "fitted"
 
     monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "problem", given_problem)
     monkeypatch.setattr(detectors, "calibrate", calibrate)
     monkeypatch.setattr(detectors, "fitted", fitted)
     stage = stage_of("detector_lidar", config)

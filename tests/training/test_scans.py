@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import inputs_of, learn_by_stages
+from tiny import given_problem, inputs_of, learn_by_stages
 
 from jaxsense import PRESETS, Config, looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
@@ -19,7 +19,7 @@ from jaxsense.training import scans
 from jaxsense.training.detections import Shown, repeated
 from jaxsense.training.stage import Stage
 from jaxsense.training.surveys import draw_scenes, num_scenes
-from jaxsense.vae import leave_one_out
+from jaxsense.vae import detectors, leave_one_out
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
@@ -171,6 +171,7 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     used = []
     monkeypatch.setattr(leave_one_out, "calibrate", calibrate)
     monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "problem", given_problem)
     inputs = inputs_of(stage.name, TINY, outputs)
     state = stage.begin(KEY, TINY, **inputs)
     state, _ = stage.advance(KEY, TINY, state, **inputs)
