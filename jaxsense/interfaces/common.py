@@ -33,16 +33,9 @@ def extra(name: str) -> Iterator[None]:
         raise ModuleNotFoundError(message, name=package) from None
 
 
-def environment(mdp: Mdp | Environment, modality: int | None) -> Environment:
-    """A task as it is, or the MDP of one robot whose sensor has the index `modality`."""
-    if isinstance(mdp, Mdp):
-        if mdp.teams is not None:
-            raise ValueError("mdp is of teams: must be of one robot, with dqn.task = 'map'")
-        checks.require_index("modality", modality, mdp.num_modalities)
-        return Environment(mdp.of(modality))  # pyright: ignore[reportArgumentType]
-    if modality is not None:
-        raise ValueError(f"modality = {modality}: must be None with a task, which has its agent")
-    return mdp
+def environment(mdp: Mdp | Environment) -> Environment:
+    """A task as it is, or an MDP."""
+    return Environment(mdp) if isinstance(mdp, Mdp) else mdp
 
 
 def prepared_starts(key: Key, mdp: Mdp | Environment, number: int) -> PyTree:
@@ -53,9 +46,8 @@ def prepared_starts(key: Key, mdp: Mdp | Environment, number: int) -> PyTree:
     """
     checks.require_key(key)
     checks.require_number("number of starts", number)
-    played = Environment(mdp) if isinstance(mdp, Mdp) else mdp
     reset = jax.jit(jax.vmap(lambda key, played: played.reset(key)[1], (0, None)))
-    return reset(jax.random.split(key, number), played)
+    return reset(jax.random.split(key, number), environment(mdp))
 
 
 def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, " S"], PyTree]:

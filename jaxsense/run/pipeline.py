@@ -127,7 +127,7 @@ def learn(
             "detectors": jax.tree.map(
                 lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
             ),
-            "jmvae": make.jmvae(vars(latent) | grouped),
+            "jmvae": make.jmvae(latent | grouped),
             "belief": beliefs,
             "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
         },

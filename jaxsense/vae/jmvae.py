@@ -120,24 +120,17 @@ def encode(
       features: for each modality `[D_m]`, or None where it is missing.
     """
     checks.require_one_each("features", features, model.modalities)
-    subset = tuple(m for m, feature in enumerate(features) if feature is not None)
-    if not subset:
+    if all(feature is None for feature in features):
         raise ValueError(f"features = {features}: must hold one modality or more")
-    _require_features("features", model, features, ())
+    for name, size, feature in zip(model.modalities, model.feature_sizes, features, strict=True):
+        if feature is not None:
+            checks.require_shape(f"features of {name}", feature, (size,))
+            checks.require_finite(f"features of {name}", feature)
+    subset = tuple(m for m, feature in enumerate(features) if feature is not None)
     if subset in model.subsets:
         return _encode(params, model, subset, features)
     alone = [_encode(params, model, (m,), features) for m in subset]
     return gaussian.product(*map(jnp.stack, zip(*alone, strict=True)))
-
-
-def _require_features(
-    name: str, model: Jmvae, features: Features, axes: tuple[int | None, ...]
-) -> None:
-    """Raises `ValueError` unless those of each modality are finite numbers of its size."""
-    for modality, size, found in zip(model.modalities, model.feature_sizes, features, strict=True):
-        if found is not None:
-            checks.require_shape(f"{name} of {modality}", found, (*axes, size))
-            checks.require_finite(f"{name} of {modality}", found)
 
 
 def _encode(
@@ -291,9 +284,11 @@ def train(
 def _require_bank(bank: Samples, model: Jmvae) -> None:
     """Raises `ValueError` unless each modality has finite features of looks at the same classes."""
     checks.require_one_each("bank", bank, model.modalities)
-    _require_features("bank", model, bank, (*np.shape(bank[0])[:1], None))
-    for name, features in zip(model.modalities, bank, strict=True):
-        checks.require_number(f"rows in the bank of {name}", len(features) * features.shape[1])
+    for name, size, features in zip(model.modalities, model.feature_sizes, bank, strict=True):
+        of_modality = f"bank of {name}"
+        checks.require_shape(of_modality, features, (*np.shape(bank[0])[:1], None, size))
+        checks.require_number(f"rows in the {of_modality}", len(features) * features.shape[1])
+        checks.require_finite(of_modality, features)
     if len(bank[0]) == 1 < min(len(bank), bank[0].shape[1]):
         expected = "must be two or more; give rows [N, D] as x[:, None], not x[None]"
         raise ValueError(f"bank has one class with {bank[0].shape[1]} looks: {expected}")

@@ -255,7 +255,6 @@ FUNCTIONS = [
     (lambda w: dqn.reset(w.key, w.mdp, w.classes, w.means), "seen of dtype float32: must be bool"),
     (lambda w: interfaces_common.prepared_starts(0, w.mdp, 2), "key = 0: must be one key"),
     (lambda w: interfaces_common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),
-    (lambda w: interfaces_common.environment(jaxsense.make("team-v0").mdp, 0), "mdp is of teams"),
     (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
     (
         lambda w: readout.plausible_classes(w.belief_of(mean=w.x * NAN), w.means),
@@ -421,15 +420,10 @@ def test_environments_refuse(given_world):
     mdp = given_world.mdp
     for number in (0, -1, 1.5, True, "2"):
         with pytest.raises(ValueError, match=r"num_envs = .*: must be a whole number greater"):
-            gymnasium.MapVectorEnv(mdp, 0, number)
-    for modality in (2, -1):
-        with pytest.raises(ValueError, match=r"modality = .*: must be a whole number from 0 to 1"):
-            gymnasium.MapVectorEnv(mdp, modality, 2)
-        with pytest.raises(ValueError, match=r"modality = .*: must be a whole number from 0 to 1"):
-            gymnax.MapEnv(mdp, modality)
+            gymnasium.MapVectorEnv(mdp, num_envs=number)
     with pytest.raises(ValueError, match="Later"):
-        gymnasium.MapVectorEnv(mdp, 0, 2, autoreset_mode="Later")
-    env = gymnasium.MapVectorEnv(mdp, 0, 2)
+        gymnasium.MapVectorEnv(mdp, num_envs=2, autoreset_mode="Later")
+    env = gymnasium.MapVectorEnv(mdp, num_envs=2)
     for mask in ([True], [1, 0], "x", np.ones(3, bool)):
         with pytest.raises(ValueError, match=r"reset_mask = .*: must hold 2 booleans"):
             env.reset(options={"reset_mask": mask})
@@ -439,4 +433,4 @@ def test_environments_refuse(given_world):
             env.step(actions)
     start = gymnax.MapEnvState(time=0, map=given_world.state, terminated=jnp.bool_(False))
     with pytest.raises(ValueError, match="action = 4: must be a whole number from 0 to 3"):
-        gymnax.MapEnv(mdp, 0).step_env(given_world.key, start, 4, gymnax.MapEnvParams())
+        gymnax.MapEnv(mdp).step_env(given_world.key, start, 4, gymnax.MapEnvParams())

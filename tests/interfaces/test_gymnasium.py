@@ -34,7 +34,7 @@ def starts():
 
 @pytest.fixture
 def make(starts):
-    return functools.partial(MapVectorEnv, small.small_mdp(), LIDAR, starts=starts)
+    return functools.partial(MapVectorEnv, small.small_mdp().of(LIDAR), starts=starts)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
@@ -90,7 +90,7 @@ def test_the_mdp_is_an_input_of_the_programs(make):
     other = dataclasses.replace(mdp, looks=jax.tree.map(lambda x: x[::-1], mdp.looks))
     seen, programs = [], []
     for each in (mdp, other):
-        env = MapVectorEnv(each, LIDAR, 3, make.keywords["starts"])
+        env = MapVectorEnv(each.of(LIDAR), num_envs=3, starts=make.keywords["starts"])
         env.reset(seed=3)
         seen.append(env.step(np.zeros(3, int))[0])
         programs.append((ours._start._cache_size(), ours._step._cache_size()))
@@ -165,5 +165,3 @@ def test_what_cannot_be_is_told(make):
         ours.TaskEnv("map-v0", render_mode="ansi")
     with pytest.raises(ConfigError, match="agent = 'sonar': must be one of camera, lidar"):
         gymnasium.make("jaxsense/map-v0", agent="sonar")
-    with pytest.raises(ValueError, match="modality = 0: must be None with a task"):
-        MapVectorEnv(jaxsense.make("map-v0"), 0)
