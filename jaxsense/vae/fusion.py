@@ -13,6 +13,7 @@ Log-likelihoods that are linear in the moments of the classes keep the weights a
 `readout` reads without error: a belief is a sufficient memory.
 """
 
+import functools
 import itertools
 from collections.abc import Mapping
 
@@ -78,12 +79,26 @@ class InPlace(Reader):
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look, see `Fusion.update` and `fuse`; `weight` is not used."""
+        """Belief after one more look, see `Fusion.update`; `weight` is not used.
+
+        The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
+        """
         del weight
-        checks.require_modality(modality, self.model.modalities)
-        number = len(self.model.modalities)
-        of_all = tuple(features if m == modality else None for m in range(number))
-        return fuse(self.params, self.model, belief, seen, of_all)
+        model = self.model
+        checks.require_modality(modality, model.modalities)
+        chex.assert_shape(seen, (len(model.modalities),))
+        checks.require_belief("belief", belief, model.latent_size)
+        checks.require_probabilities(f"features of {model.modalities[modality]}", features)
+        generated, fused = jmvae.decode(self.params, model, belief.mean), belief
+        others = [m for m in range(len(model.modalities)) if m != modality]
+        has_looked = jnp.asarray(seen)[np.array(others, int)]
+        sizes = range(len(others) + 1)
+        # One encoder for each set of the others that may have looked; `seen` selects one.
+        for subset in itertools.chain(*(itertools.combinations(others, n) for n in sizes)):
+            candidate = self.together({**{m: generated[m] for m in subset}, modality: features})
+            applies = jnp.all(has_looked == np.isin(others, subset))
+            fused = jax.tree.map(functools.partial(jnp.where, applies), candidate, fused)
+        return fused
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Posterior `q(z|x)`, see `Fusion.together`."""
@@ -91,43 +106,6 @@ class InPlace(Reader):
             checks.require_modality(modality, self.model.modalities)
         features = tuple(looks.get(m) for m in range(len(self.model.modalities)))
         return jmvae.posterior(self.params, self.model, features)
-
-
-@checks.typed
-def fuse(
-    params: Params,
-    model: Jmvae,
-    belief: Belief,
-    seen: Bool[Array | np.ndarray, " M"],
-    features: Features,
-) -> Belief:
-    """Fuses looks by one sensor, or by several together, in place.
-
-    The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
-
-    Args:
-      belief: `[D]` before the looks.
-      seen: `[M]` bool, which modalities have looked before.
-      features: for each modality `[D_m]` new features, or None where it has not looked.
-    """
-    chex.assert_shape(seen, (len(model.modalities),))
-    checks.require_belief("belief", belief, model.latent_size)
-    generated = jmvae.decode(params, model, belief.mean)
-    is_new = np.array([new is not None for new in features])
-    others = np.flatnonzero(~is_new).tolist()
-    fused = belief
-    # One encoder for each set of modalities that may have looked before; `seen` selects one.
-    for size in range(len(others) + 1):
-        for subset in itertools.combinations(others, size):
-            inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
-            candidate = jmvae.posterior(params, model, inputs)
-            is_subset = np.array([m in subset for m in range(len(features))])
-            applies = jnp.all(is_new | (jnp.asarray(seen) == is_subset))
-            fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
-    for name, new in zip(model.modalities, features, strict=True):
-        if new is not None:
-            checks.require_probabilities(f"features of {name}", new)
-    return fused
 
 
 def decoding(

@@ -233,11 +233,11 @@ FUNCTIONS = [
     ),
     (lambda w: w.filter.update(w.belief, w.seen, w.look, 0, NAN), "weight = nan"),
     (
-        lambda w: vae.fuse(w.params, w.model, w.belief_of(std=-w.belief.std), w.seen, (w.x, None)),
+        lambda w: w.in_place.update(w.belief_of(std=-w.belief.std), w.seen, w.look, 0),
         "belief.std = -1.0",
     ),
     (
-        lambda w: vae.fuse(w.params, w.model, w.belief, w.seen, (w.look, w.x)),
+        lambda w: w.in_place.update(w.belief, w.seen, w.x, 1),
         "sum of features of lidar = 0.0",
     ),
     (lambda w: vae.posterior(w.params, w.model, (None, w.x * NAN)), "features of lidar = nan"),

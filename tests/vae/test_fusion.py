@@ -1,6 +1,5 @@
 """Fusion in place: which encoder is asked, and with what; and what every kind of fusion has."""
 
-import functools
 import itertools
 
 import jax
@@ -45,18 +44,6 @@ def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others():
             inputs = [g if s else None for g, s in zip(generated, seen, strict=True)]
             inputs[modality] = new  # never generated, whether it has been seen before or not
             assert_same(belief, encode(params, model, tuple(inputs)))
-
-
-def test_several_sensors_may_look_at_once():
-    # What has looked before and does not look now is decoded; all the others are as they are.
-    params = random_params(jmvae.init, THREE)
-    camera, _, sonar = looks(THREE)
-    fuse = jax.jit(functools.partial(fusion.fuse, params, THREE))
-    generated = decode(params, THREE, OLD.mean)
-    for has_lidar in (False, True):
-        belief = fuse(OLD, np.array([True, has_lidar, False]), (camera, None, sonar))
-        lidar = generated[1] if has_lidar else None
-        assert_same(belief, encode(params, THREE, (camera, lidar, sonar)))
 
 
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
