@@ -136,13 +136,15 @@ def fit_stage(name: str, settings: FitConfig, fit: Callable[..., Fit]) -> Stage:
     return Stage(name, begin, advance, finish, settings.steps, chunks)
 
 
-def restarts(
-    config: Config, start: Callable[..., tuple[Callable[[Key], Params], Problem[Any]]]
-) -> list[Stage]:
+Start = tuple[Callable[[Key], Params], Problem[Any]]
+"""What draws parameters to start from, and the problem that they are fitted to."""
+
+
+def restarts(config: Config, start: Callable[..., Start]) -> list[Stage]:
     """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk.
 
     Args:
-      start: `(config, **inputs)` to what draws parameters to start from, and the problem.
+      start: `(config, **inputs) -> Start`.
     """
 
     def fit(config: Config, **inputs: Output) -> Fit:

@@ -12,7 +12,7 @@ from tiny import KEY, SMOKE, given_problem, stage_of
 from jaxsense import looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
-from jaxsense.training.surveys import Survey, num_scenes
+from jaxsense.training.detections import Survey, num_scenes
 from jaxsense.vae import detectors
 
 
