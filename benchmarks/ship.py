@@ -19,7 +19,7 @@ import numpy as np
 import jaxsense
 from jaxsense import Bank, Config, Models
 from jaxsense.config import as_plain
-from jaxsense.core.types import Samples
+from jaxsense.core.types import Samples, by_place
 from jaxsense.tasks import PRETRAINED, Task, registry
 from jaxsense.tasks.registry import Origin
 from jaxsense.tasks.task import EPISODES, SEEDS, Scaling
@@ -151,7 +151,7 @@ def scaling_of(key: jax.Array, task: Task) -> Scaling:
 
 def write(file: Path, trees: Mapping[str, Any], config: Config, made: Origin) -> None:
     """Writes trees of arrays, with the settings and the origin of the models."""
-    arrays = {name: np.asarray(leaf) for name, leaf in registry.flat(trees).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in by_place(trees).items()}
     about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
     text = np.array(json.dumps(about, allow_nan=False))
     partial = file.with_suffix(".part.npz")  # a task's file is written once

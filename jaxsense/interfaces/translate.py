@@ -22,6 +22,8 @@ from jax.lax import GatherScatterMode, RoundingMethod
 from jaxtyping import PyTree
 from onnx import checker, helper, numpy_helper
 
+from jaxsense.core.types import by_place
+
 OPSET, IR_VERSION = 18, 9
 """The version of the operators, and of the file: of December 2022, so that old runtimes read it."""
 
@@ -461,8 +463,7 @@ def program(
     """
     # Parameters that a user has made with NumPy may have 64 bits.
     models = jax.tree.map(lambda x: np.asarray(jnp.asarray(x)), models)
-    leaves = jax.tree_util.tree_leaves_with_path(models)
-    weights = {jax.tree_util.keystr(p, simple=True, separator="/"): x for p, x in leaves}
+    weights = by_place(models)
     closed, outputs = jax.make_jaxpr(apply, return_shape=True)(models, *inputs.values())
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(outputs))
     given = list(itertools.compress([*weights, *inputs], is_read))

@@ -19,6 +19,7 @@ from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 from jaxsense.core import inside
+from jaxsense.core.types import by_place
 from jaxsense.run.monitor import is_finite
 
 T = TypeVar("T")
@@ -169,7 +170,7 @@ class Checkpoints:
         """Saves a pytree of arrays; raises `OSError` if the file cannot be written."""
         file, tree = self._file(name), jax.tree.map(np.asarray, tree)
         file.parent.mkdir(parents=True, exist_ok=True)
-        content = serialization.msgpack_serialize(serialization.to_state_dict(tree))
+        content = serialization.msgpack_serialize(by_place(tree))
         write_digested(file, content)
 
     def load(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree:
@@ -224,7 +225,8 @@ class Checkpoints:
 
 
 def _like(shapes: PyTree[T], found: PyTree, finite: bool = False) -> PyTree[np.ndarray]:
-    """A tree like `shapes` from nested dictionaries; raises `ValueError` if they differ."""
+    """A tree like `shapes` from arrays by their places; raises `ValueError` if they differ."""
+    expected = by_place(shapes)
 
     def check(expected: jax.ShapeDtypeStruct, found: np.ndarray) -> np.ndarray:
         found = np.asarray(found)
@@ -233,8 +235,9 @@ def _like(shapes: PyTree[T], found: PyTree, finite: bool = False) -> PyTree[np.n
             raise ValueError(f"{found.dtype}{found.shape} in place of {wanted}")
         return found
 
-    if jax.tree.structure(serialization.to_state_dict(shapes)) != jax.tree.structure(found):
+    if not isinstance(found, dict) or found.keys() != expected.keys():
         raise ValueError("it holds other arrays")
     if finite and not is_finite(found):
         raise ValueError("it holds numbers that are not finite")
-    return jax.tree.map(check, shapes, serialization.from_state_dict(shapes, found))
+    arrays = [check(shape, found[place]) for place, shape in expected.items()]
+    return jax.tree.unflatten(jax.tree.structure(shapes), arrays)

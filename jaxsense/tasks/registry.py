@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,7 +15,7 @@ from jaxsense import models
 from jaxsense.config import Config, ConfigError, from_plain
 from jaxsense.config.options import without_former
 from jaxsense.config.section import require_32_bits
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, by_place
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.task import Scaling, Task, fixed_draws, key_of_seed
@@ -210,12 +210,6 @@ def fill(arrays: Arrays, name: str, shapes: T) -> T:
             raise ValueError(f"{place} {shown}: must have shape {shape.shape}")
         return jnp.asarray(found, shape.dtype)
 
-    places = flat({name: shapes})
+    places = by_place({name: shapes})
     leaves = [leaf(place, shape) for place, shape in places.items()]
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
-
-
-def flat(trees: Mapping[str, PyTree]) -> dict[str, PyTree]:
-    """The leaves of trees, by their places in them."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(trees)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}

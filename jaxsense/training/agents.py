@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import Config
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import FitState
+from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import optimum, rewards, tours
@@ -221,7 +221,8 @@ def _tour_stage(config: Config) -> Stage:
         followed = _Auction(mdp, fusion, look_values)
         found = tours.try_choices(try_key, mdp, followed, number)
         trials = tours.write(trials, found, fit.step // size * number)
-        problem = tours.Fitting(settings, trials, make_agent(config))
+        fitting = tours.Fitting(settings, trials, make_agent(config))
+        problem = Problem(settings, fitting.draw, fitting.loss)
         fit, losses = supervised.fit(draw_key, fit, problem, size)
         return (fit, trials), Progress(losses, {})
 

@@ -2,12 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-import pytest
-from flax import serialization
 
 from jaxsense import sim
-from jaxsense.core.types import Belief, pytree
+from jaxsense.core.types import Belief, by_place, pytree
 
 
 def own_reward(value):
@@ -37,15 +34,9 @@ def test_a_class_that_is_defined_again_runs_its_own_program():
     assert wrong_programs(12) == 0
 
 
-def test_state_dictionaries_are_those_of_earlier_checkpoints():
-    belief = Belief(jnp.arange(2.0), jnp.ones(2))
-    state = serialization.to_state_dict(belief)
-    assert list(state) == ["mean", "std"]
-    blank = jax.tree.map(jnp.zeros_like, belief)
-    found = serialization.from_state_dict(blank, state)
-    np.testing.assert_array_equal(found.mean, [0, 1])
-    with pytest.raises(ValueError, match="Belief"):
-        serialization.from_state_dict(blank, {"mean": state["mean"]})
+def test_leaves_are_found_by_their_places():
+    tree = {"a": (Belief(1, 2),), "b": {"c": 3}}
+    assert by_place(tree) == {"a/0/mean": 1, "a/0/std": 2, "b/c": 3}
 
 
 def own_sensor(value):
