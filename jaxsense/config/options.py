@@ -194,12 +194,13 @@ class Option:
 
     def value(self, found: bool | str | list[str]) -> object:
         """Reads what is given. Words of another type stay text, which the dataclass refuses."""
-        kind, is_none = self.words[0], found in ("none", "None", ["none"], ["None"])
-        if isinstance(found, bool) or (self.is_optional and is_none):
-            return None if is_none else found
-        if isinstance(found, str):
-            return _of_type(kind, found)
-        return tuple(_of_type(kind, word) for word in found)
+        if isinstance(found, bool):
+            return found
+        words = found if isinstance(found, list) else [found]
+        if self.is_optional and [word.lower() for word in words] == ["none"]:
+            return None
+        values = tuple(_of_type(self.words[0], word) for word in words)
+        return values if isinstance(found, list) else values[0]
 
 
 def options_of(base: object, name: str = "--", path: str = "") -> Iterator[Option]:
@@ -235,7 +236,7 @@ class _Parser(argparse.ArgumentParser):
         for option in options:
             place = getattr(option.section, "PLACE", "")
             if place not in groups:
-                description = about(option.section) if place else None
+                description = about(option.section).replace("`", "") if place else None
                 groups[place] = self.add_argument_group(place or "options", description)
             option.declare(groups[place])
 
@@ -321,10 +322,14 @@ def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
       common: options to show, in this order; by default all, by section.
     """
     options = {option.name: option for option in options_of(base)}
-    usage = " ".join([command(program), "[OPTIONS]", *(x for x in options if x[0] != "-")])
+    named = (x for name, x in options.items() if not name.startswith("-"))
+    words = (f"[{x.name} ...]" if x.words[1] else x.name for x in named)
+    usage = " ".join([command(program), "[OPTIONS]", *words])
     shown = (options[name] for name in common or options)
     end = f"--help-all lists all {len(options)} options." if common else ""
-    return _Parser(shown, usage=usage, description=about(base), epilog=end).format_help()
+    return _Parser(
+        shown, usage=usage, description=about(base).replace("`", ""), epilog=end
+    ).format_help()
 
 
 def about(section: object) -> str:

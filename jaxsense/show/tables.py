@@ -22,7 +22,6 @@ from jaxsense.summary.blocks import (
     policies,
     text,
 )
-from jaxsense.summary.compare import AS_ACCURATE
 
 # Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
 _PAPER_CLASSES = {"green cylinder", "red cylinder", "red cube"}
@@ -50,14 +49,12 @@ class Table:
       columns: their names.
       rows: the name of each, and a text for each column.
       meanings: explanations, by names of columns.
-      best: rows and columns of values to highlight.
     """
 
     caption: str
     columns: list[str]
     rows: list[tuple[str, list[str]]]
     meanings: dict[str, str] = dataclasses.field(default_factory=dict)
-    best: frozenset[tuple[int, int]] = frozenset()
 
 
 def _table(
@@ -134,7 +131,7 @@ def paper(results: Results) -> Table | None:
 
 
 def missions(block: Missions, caption: str) -> Table:
-    """The policies that played in the same arenas, with the best values marked."""
+    """The policies that played in the same arenas."""
     return _missions(policies(block), caption)
 
 
@@ -149,13 +146,10 @@ _CAPTIONS = {
     "calibration": "Calibration of the maps",
     "intervals": "Difference from the latent policy in the same arenas, with 95 % intervals",
 }
-_UNFINISHED = {
-    "unfinished": (
-        "Missions that no robot ended by choice: after `mission.time_limit`, or because a PoI was "
-        "unreachable or showed nothing, no look would have been new, or robots failed."
-    ),
-    "in bold": "The best value among policies that are as accurate as the best one.",
-}
+_UNFINISHED = (
+    "Missions that no robot ended by choice: after `mission.time_limit`, or because a PoI was "
+    "unreachable or showed nothing, no look would have been new, or robots failed."
+)
 
 
 def _missions(played: Mapping[str, Case], caption: str) -> Table:
@@ -166,28 +160,13 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
         words = (f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items())
         rows.append((name, [*texts, ", ".join(words)]))
-    columns, meanings = [*table.columns, "unfinished"], {**table.meanings, **_UNFINISHED}
+    columns, meanings = [*table.columns, "unfinished"], table.meanings | {"unfinished": _UNFINISHED}
     if "naive" in played:
         columns.insert(3, "against naive")
         meanings["against naive"] = "Difference of the median times."
         for (_, texts), case in zip(rows, played.values(), strict=True):
             texts.insert(3, _percent(case["time_s"], played["naive"]["time_s"]))
-    values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
-    return Table(caption, columns, rows, meanings, _best(values))
-
-
-def _best(values: list[list[float]]) -> frozenset[tuple[int, int]]:
-    """The highest accuracy, and the least looks and time of the rows that are about as accurate."""
-    most = max((accuracy for accuracy, *_ in values), default=0.0)
-    able = [row for row in values if row[0] >= most - AS_ACCURATE]
-    least = [min(column) for column in zip(*able, strict=True)]
-    found = set[tuple[int, int]]()
-    for r, row in enumerate(values):
-        # A value alone is not the best of any.
-        found |= {(r, 0)} if row[0] == most and len(values) > 1 else set()
-        if row in able and len(able) > 1:
-            found |= {(r, c) for c in (1, 2) if row[c] == least[c]}
-    return frozenset(found)
+    return Table(caption, columns, rows, meanings)
 
 
 def all_of_missions(block: Missions) -> list[Table]:

@@ -99,12 +99,8 @@ def as_text(console: rich.console.Console, table: Table) -> str:
     drawn.title = rich.text.Text(table.caption)
     for name in table.columns:
         drawn.add_column(rich.text.Text(name), justify="right")
-    for r, (name, values) in enumerate(table.rows):
-        cells = (
-            rich.text.Text(value, "bold" if (r, i) in table.best else "")
-            for i, value in enumerate(values)
-        )
-        drawn.add_row(rich.text.Text(name), *cells)
+    for name, values in table.rows:
+        drawn.add_row(*map(rich.text.Text, (name, *values)))
     if not console.is_terminal:
         # Even the nothing that it writes while it is captured fails on a full disk.
         nowhere = io.TextIOWrapper(io.BytesIO(), getattr(console.file, "encoding", None))

@@ -14,7 +14,7 @@ from jaxsense.summary.blocks import Interval, Missions, Origin, Results, Summary
 REFERENCE = "latent"
 """The policy that the others are compared with."""
 
-AS_ACCURATE = 0.005
+_AS_ACCURATE = 0.005
 """Difference of accuracies that does not matter when times and looks are compared."""
 
 Measured = Mapping[str, PyTree[np.ndarray]]
@@ -165,12 +165,12 @@ def verdict(played: Missions) -> str | None:
         for name in played
         if not (is_fault(name) or name.startswith("naive"))
         and ratios[name] > 1 / (1 - _AS_FAST)
-        and accuracy[name] > accuracy[REFERENCE] - AS_ACCURATE
+        and accuracy[name] > accuracy[REFERENCE] - _AS_ACCURATE
     ]
     if faster:
         text += f" (and {against(max(faster, key=lambda name: ratios[name]))})"
     right, usual = accuracy[REFERENCE], accuracy["naive"]
-    if abs(right - usual) >= AS_ACCURATE:
+    if abs(right - usual) >= _AS_ACCURATE:
         text += f". It labels {100 * right:.1f}\u00a0% of the PoIs right, naive exploration "
         text += f"{100 * usual:.1f}\u00a0%"
     return f"{text}."
