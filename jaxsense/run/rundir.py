@@ -70,8 +70,8 @@ class RunDirectory:
             run = cls(place, settings)
             with _writable(place, "out"):
                 run._remove_partial()
-                _check_empty(place)  # once more: another process may have been faster
-                write_json(place / "config.json", as_json(settings))
+                # There is none, unless another process has been faster.
+                write_json(place / "config.json", as_json(settings), is_new=True)
             try:
                 yield run
             except (ConfigError, KeyboardInterrupt):
@@ -203,7 +203,11 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
         is_new = path is None or not path.exists()
         path = path or dated(name)
         path.mkdir(parents=True, exist_ok=True)
-        _check_empty(path)
+        for each in path.iterdir():
+            # A process that was killed at once leaves these.
+            if each.name != ".lock" and not files.is_unfinished(each, "config.json"):
+                reason = "is not empty; must be a new or empty directory"
+                raise ConfigError("out", str(path), reason)
     try:
         yield path
     finally:
@@ -221,12 +225,6 @@ def _writable(path: Path, field: str) -> Iterator[None]:
         raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
 
 
-def _check_empty(path: Path) -> None:
-    """Raises `ConfigError` if a directory holds more than a lock and a partial `config.json`."""
-    if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
-        raise ConfigError("out", str(path), "is not empty; must be a new or empty directory")
-
-
 @contextlib.contextmanager
 def _locked(path: Path, field: str) -> Iterator[None]:
     """Locks a directory; raises `ConfigError` about `field` if that cannot be done."""
@@ -236,9 +234,11 @@ def _locked(path: Path, field: str) -> Iterator[None]:
         yield
 
 
-def write_json(path: Path, content: Mapping[str, object] | Sequence[object]) -> None:
+def write_json(
+    path: Path, content: Mapping[str, object] | Sequence[object], *, is_new: bool = False
+) -> None:
     """Writes finite numbers, texts, lists and dictionaries as a JSON file for people."""
-    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n", is_new=is_new)
 
 
 def origin() -> Origin:

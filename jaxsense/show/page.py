@@ -71,7 +71,6 @@ def render(
             tables.latent_space(summary),
             tables.unambiguous(summary, config.arena.classes),
         ],
-        paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
         counted=tables.counted,
         changed=_changed(config, summary["preset"]),

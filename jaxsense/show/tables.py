@@ -23,20 +23,6 @@ from jaxsense.summary.blocks import (
     text,
 )
 
-# Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
-_PAPER_CLASSES = {"green cylinder", "red cylinder", "red cube"}
-_PAPER_CERTAIN = {("green cylinder", "camera"), ("red cube", "lidar")}
-_PAPER_PERMUTATIONS = 384  # states of the paper's task
-_PAPER = {
-    "return": "Fig. 5",
-    "optimal": "0.550*",
-    "one_step.policy": "0.340, 0.385*",
-    "one_step.optimal": "0.426*",
-    "one_step.random": "-0.302*",
-    "optimal_permutations": "",
-    "num_permutations": "384",
-    "env_steps": "2,000 epochs",
-}
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
 
@@ -92,42 +78,25 @@ def latent_space(results: Results) -> Table:
 
 
 def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
-    """Classes that each sensor alone, and all together, identify with certainty.
+    """Classes that each sensor alone, and all together, identify with certainty (Table I).
 
-    Next to each is the paper's result if it has the same classes and sensors. Raises `ConfigError`
-    if the results are of other `classes`.
+    Raises `ConfigError` if the results are of other `classes`.
     """
     block = results["jmvae"]
     columns = sorted(block["unambiguous"], key="joint".__eq__)
     blocks = block["unambiguous"], block["consistent"], block["sigma_norm"]
     if {len(each.get(name, ())) for each in blocks for name in columns} - {len(classes)}:
         raise ConfigError("jmvae", columns, f"must each have a value for {len(classes)} classes")
-    is_paper = set(classes) == _PAPER_CLASSES and set(columns) == {"camera", "lidar", "joint"}
 
     def cell(c: int, name: str) -> str:
         holds, consistent, norm = (mean(each[name][c]) for each in blocks)
         here = _YES_OR_NO.get(holds, f"{holds:.0%}")  # of several seeds
-        if is_paper:
-            here += f" / {_YES_OR_NO[name == 'joint' or (classes[c], name) in _PAPER_CERTAIN]}"
         return f"{here} ({consistent:.1%}, {norm:.2f})"
 
-    caption = "Classes identified with certainty" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
     brackets = "Share of looks that leave exactly the classes that this sensor cannot tell apart; "
-    brackets += "mean sigma norm, in the paper's Fig. 4 from 1.05 to 1.25."
-    return Table(caption, columns, rows, {"In brackets": brackets})
-
-
-def paper(results: Results) -> Table | None:
-    """The Q-networks compared with the paper's; None if its task is another."""
-    agents = results["dqn"]
-    if any(mean(agent["num_permutations"]) != _PAPER_PERMUTATIONS for agent in agents.values()):
-        return None
-    rows = [
-        (AGENTS[key].label, [*(AGENTS[key].text(agent) for agent in agents.values()), there or "-"])
-        for key, there in _PAPER.items()
-    ]
-    return Table("Comparison with the paper", [*agents, "paper"], rows)
+    brackets += "mean sigma norm."
+    return Table("Classes identified with certainty", columns, rows, {"In brackets": brackets})
 
 
 def missions(block: Missions, caption: str) -> Table:
