@@ -80,6 +80,26 @@ def by_place(tree: PyTree) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
 
 
+def placed(shapes: PyTree, arrays: Mapping[str, Any]) -> PyTree[np.ndarray]:
+    """A tree like `shapes`, from arrays by their places in it.
+
+    Raises:
+      ValueError: if one is missing or has another shape or dtype.
+    """
+
+    def leaf(place: str, expected: jax.ShapeDtypeStruct) -> np.ndarray:
+        if place not in arrays:
+            raise ValueError(f"{place} is missing")
+        found = np.asarray(arrays[place])
+        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+            wanted = f"{expected.dtype}{expected.shape}"
+            raise ValueError(f"{place} is {found.dtype}{found.shape} in place of {wanted}")
+        return found
+
+    leaves = [leaf(*each) for each in by_place(shapes).items()]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
 @pytree
 class Belief:
     """Belief about a point of interest: a diagonal Gaussian in the latent space.

@@ -9,7 +9,7 @@ import secrets
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import filelock
 import jax
@@ -19,7 +19,7 @@ from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 from jaxsense.core import inside
-from jaxsense.core.types import by_place
+from jaxsense.core.types import by_place, placed
 from jaxsense.run.monitor import is_finite
 
 T = TypeVar("T")
@@ -190,7 +190,13 @@ class Checkpoints:
         most = _REST + 8 * sum(x.size for x in jax.tree.leaves(shapes))
         try:
             content = without_digest(inside.read(self._file(name), most))
-            return _like(shapes, serialization.msgpack_restore(content), finite)
+            found: Any = serialization.msgpack_restore(content)
+            if found.keys() != by_place(shapes).keys():
+                raise ValueError("it holds other arrays")
+            tree = placed(shapes, found)
+            if finite and not is_finite(tree):
+                raise ValueError("it holds numbers that are not finite")
+            return tree
         except FileNotFoundError:
             reason = "is missing; must be that of a finished run"
         except OSError as error:
@@ -222,22 +228,3 @@ class Checkpoints:
         """The file of a checkpoint, which may be a link; raises `OSError` if it is elsewhere."""
         file = self.path / f"{name}{_SUFFIX}"
         return inside.place(file.parent, self.path.parent) / file.name
-
-
-def _like(shapes: PyTree[T], found: PyTree, finite: bool = False) -> PyTree[np.ndarray]:
-    """A tree like `shapes` from arrays by their places; raises `ValueError` if they differ."""
-    expected = by_place(shapes)
-
-    def check(expected: jax.ShapeDtypeStruct, found: np.ndarray) -> np.ndarray:
-        found = np.asarray(found)
-        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-            wanted = f"{expected.dtype}{expected.shape}"
-            raise ValueError(f"{found.dtype}{found.shape} in place of {wanted}")
-        return found
-
-    if not isinstance(found, dict) or found.keys() != expected.keys():
-        raise ValueError("it holds other arrays")
-    if finite and not is_finite(found):
-        raise ValueError("it holds numbers that are not finite")
-    arrays = [check(shape, found[place]) for place, shape in expected.items()]
-    return jax.tree.unflatten(jax.tree.structure(shapes), arrays)

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +14,12 @@ from jaxsense import models
 from jaxsense.config import Config, ConfigError, from_plain
 from jaxsense.config.options import without_former
 from jaxsense.config.section import require_32_bits
-from jaxsense.core.types import Key, by_place
+from jaxsense.core.types import Key, placed
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.task import Scaling, Task, fixed_draws, key_of_seed
 from jaxsense.training.comparison import models_of
 
-T = TypeVar("T")
 Arrays = dict[str, np.ndarray]
 
 DATA = Path(__file__).parent / "data"
@@ -197,19 +195,5 @@ def _require_known(field: str, value: str, known: Iterable[str]) -> None:
 def _trained(arrays: Arrays, config: Config, *parts: str) -> dict[str, PyTree]:
     """Parts of models by their names."""
     shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    return {name: fill(arrays, name, getattr(shapes, name)) for name in parts}
-
-
-def fill(arrays: Arrays, name: str, shapes: T) -> T:
-    """The tree of a name, from the arrays that `read` returns."""
-
-    def leaf(place: str, shape: jax.ShapeDtypeStruct) -> jax.Array:
-        found = arrays.get(place)
-        if found is None or found.shape != shape.shape:
-            shown = "is missing" if found is None else f"has shape {found.shape}"
-            raise ValueError(f"{place} {shown}: must have shape {shape.shape}")
-        return jnp.asarray(found, shape.dtype)
-
-    places = by_place({name: shapes})
-    leaves = [leaf(place, shape) for place, shape in places.items()]
-    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+    found = placed({name: getattr(shapes, name) for name in parts}, arrays)
+    return jax.tree.map(jnp.asarray, found)

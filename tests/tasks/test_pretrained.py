@@ -11,7 +11,7 @@ import pytest
 import jaxsense
 from benchmarks import ship
 from jaxsense import tasks
-from jaxsense.core.types import Belief
+from jaxsense.core.types import Belief, placed
 from jaxsense.tasks import registry
 
 
@@ -81,6 +81,6 @@ def test_what_was_written_is_read_again(tmp_path):
     ship.write(tmp_path / "a.npz", {"tree": tree}, config, made)
     arrays, *about = registry.read(tmp_path / "a.npz")
     assert about == [config, made]
-    chex.assert_trees_all_equal(registry.fill(arrays, "tree", tree), tree)
+    chex.assert_trees_all_equal(placed({"tree": tree}, arrays)["tree"], tree)
     with pytest.raises(ValueError, match="tree/x is missing"):
-        registry.fill(arrays, "tree", {"x": jnp.zeros(2)})
+        placed({"tree": {"x": jnp.zeros(2)}}, arrays)
