@@ -75,10 +75,7 @@ TRAIN = [
     (["--seed"], "option = '--seed': expected one argument"),
     (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
-    (
-        ["--preset", ""],
-        "preset = '': must be one of default, paper, noisy, many, raw, team, recorded, smoke",
-    ),
+    (["--preset", ""], "preset = '': must be one of default, paper, noisy, many, raw, team"),
     (["--out", ""], "out = '': must be a path"),
     (["--out", "a\nb"], "out = 'a\\nb': must be a path of printable characters"),
     (["--cache", "file"], "cache = 'file': must be a directory"),

@@ -118,28 +118,13 @@ SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
 OF_SIXTEEN = {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN}
 CHANGES = [
     # 240 degrees / 76 = 3.16, of which three are 9.47; a PoI of 0.2 m at 1.2 m is 9.56 wide.
-    (
-        FROM_SCANS | {"lidar.num_beams": 76, "lidar.window": 20},
-        "lidar.num_beams = 76: must be at least 77 to learn from scans: so that three beams hit",
-    ),
+    (FROM_SCANS | {"lidar.num_beams": 76, "lidar.window": 20}, "lidar.num_beams = 76: must be at"),
     # 240 / 682 x 511 = 179.8 degrees.
-    (
-        FROM_SCANS | {"lidar.window": 513},
-        "lidar.window = 513: must be from 3 to 512 to learn from scans: at most 180 degrees",
-    ),
-    (
-        FROM_SCANS | {"lidar.window_range": 1.1},
-        "lidar.window_range = 1.1: must be at least viewpoint.max_distance = 1.2 m to learn from",
-    ),
+    (FROM_SCANS | {"lidar.window": 513}, "lidar.window = 513: must be from 3 to 512 to learn"),
+    (FROM_SCANS | {"lidar.window_range": 1.1}, "lidar.window_range = 1.1: must be at least"),
     # Groups of looks at the same PoIs: 16 scenes of three, of which two groups show six PoIs.
-    (
-        FROM_SCANS | OF_SIXTEEN | {"detector.num_held_out": 16},
-        "detector.num_held_out = 16: leaves some of 16 classes without a look; raise it",
-    ),
-    (
-        {"jmvae.learns_from": "scans"},
-        "jmvae.fusion = 'in_place': must be filter, because learns_from = scans",
-    ),
+    (FROM_SCANS | OF_SIXTEEN | {"detector.num_held_out": 16}, "detector.num_held_out = 16"),
+    ({"jmvae.learns_from": "scans"}, "jmvae.fusion = 'in_place': must be filter, because"),
     ({"modalities": ("lidar", "lidar")}, "must name no modality twice"),
     ({"modalities": ("camera", "sonar")}, "must be among camera, lidar"),
     (
@@ -151,7 +136,7 @@ CHANGES = [
     ),
     (
         {"modalities": ("camera",), "jmvae.reconstruction_weights": (1.0,), "arena.classes": REDS},
-        "robots = ('camera',): must distinguish some of red cylinder, red cube",
+        "robots = ('camera',): must distinguish some of red cylinder, red",
     ),
     ({"sensors": {1: SensorConfig("a:b", "shape")}}, "must be a dictionary from names"),
     ({"sensors": {"": SensorConfig("a:b", "shape")}}, "sensors = '': must be a word of 1 to 64"),
@@ -169,10 +154,7 @@ CHANGES = [
         "arena.num_pois = 26: must be at most 25: no more PoIs of radius 0.1 m with gaps of 0.3 m "
         "fit into an arena of side 3.0 m",
     ),
-    (
-        {"camera.field_of_view": 30.0},
-        "camera.field_of_view = 30.0: must be at least 42 degrees",
-    ),
+    ({"camera.field_of_view": 30.0}, "camera.field_of_view = 30.0: must be at least 42 degrees"),
     ({"lidar.window": 684}, "lidar.window = 684: must be at most 683: it has 683 rays, with a"),
     ({"camera.window": 161}, "camera.window = 161: must be at most 160: it has 640 rays, with a"),
     ({"lidar.max_range": 0.08}, "lidar.max_range = 0.08: must be above min_range = 0.08"),
@@ -209,10 +191,7 @@ CHANGES = [
     ({"dqn.replay_capacity": 65}, "dqn.replay_capacity = 65: must be a multiple of num_envs = 32"),
     ({"jmvae.reconstruction_weights": (1e-40, 1.0)}, "0 or of magnitude 1e-30 to 1e+30"),
     ({"dqn.task": np.ones(2)}, "must be one of map, team"),
-    (
-        {"dqn.replay_capacity": 32 * 10**8},
-        "must be a whole number, at least 1, below 2^31",
-    ),
+    ({"dqn.replay_capacity": 32 * 10**8}, "must be a whole number, at least 1, below 2^31"),
     ({"mission.policies": ("naive", "latent", "naive")}, "must name no policy twice"),
 ]
 
@@ -320,10 +299,7 @@ HEAT = Attribute({"hot": 60.0, "cold": 5.0})
             "sensors.thermal.attribute = 'weight': must be one of colour, shape",
         ),
         (lambda: Config(sensors={"joint": SensorConfig("a:b", "shape")}), "sensors = 'joint': al"),
-        (
-            lambda: CommunicationConfig(loss=0.5),
-            "mission.communication.loss = 0.5: must be 0 without mission.communication.own_maps",
-        ),
+        (lambda: CommunicationConfig(loss=0.5), "mission.communication.loss = 0.5: must be 0"),
         (
             lambda: changed({"mission.communication": CommunicationConfig(own_maps=True)}),
             "mission.communication.own_maps = True: must be off unless jmvae.fusion is 'filter'",
