@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 from smoke import without_times
+from summaries import OTHERS, THIS
 
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
@@ -12,39 +13,6 @@ from jaxsense.run import rundir, version
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.summary import compare
-
-THIS = {
-    "versions": {"jaxsense": "0.4.0", "python": "3.11.7", "jax": "0.10.2"},
-    "devices": ["cpu"],
-    "cores": 2,
-    "source": "aa",
-    "commit": "bb",
-}
-OTHERS = {
-    "code": ({**THIS, "source": "cc"}, "source cc and aa"),
-    "commit": ({**THIS, "commit": "dd"}, "commit dd and bb"),
-    "Python": (
-        {**THIS, "versions": {**THIS["versions"], "python": "3.13.0"}},
-        "python 3.13.0 and 3.11.7",
-    ),
-    "JAX": (
-        {**THIS, "versions": {**THIS["versions"], "jax": "0.11.2"}},
-        "jax 0.11.2 and 0.10.2",
-    ),
-    "processor": ({**THIS, "devices": ["NVIDIA H200"]}, "devices ['NVIDIA H200'] and ['cpu']"),
-}
-
-
-@pytest.mark.parametrize(("other", "words"), OTHERS.values(), ids=OTHERS)
-def test_origins_differ_in_code_versions_and_machine_and_not_in_days(other, words):
-    dated = {**THIS, "date": "2026-11-28"}
-    assert compare.differences_of([THIS, dated]) == {}
-    assert compare.several_origins([dated, THIS, THIS]) is None
-    (values,) = compare.differences_of([other, THIS, THIS, other]).values()
-    assert values[0] == values[3] != values[1] == values[2]
-    assert words.endswith(f" {values[0]} and {values[1]}")
-    told = f"Stages of this run were made with different {words}."
-    assert compare.several_origins([other, dated, other]) == told
 
 
 def begun(path, origin, monkeypatch):

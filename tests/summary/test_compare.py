@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from summaries import OTHERS, THIS
 
 from jaxsense.summary import compare
 
@@ -117,3 +118,15 @@ def test_the_times_of_seeds_add_up():
     assert total == {"total_s": 10.0, "stages": {"jmvae": {"compile_s": 4.0, "run_s": 6.0}}}
     assert of_each == {"4": blocks, "5": blocks}
     assert means["mission"] == {"x": {"mean": 1.0, "low": 1.0, "high": 1.0}}
+
+
+@pytest.mark.parametrize(("other", "words"), OTHERS.values(), ids=OTHERS)
+def test_origins_differ_in_code_versions_and_machine_and_not_in_days(other, words):
+    dated = {**THIS, "date": "2026-11-28"}
+    assert compare.differences_of([THIS, dated]) == {}
+    assert compare.several_origins([dated, THIS, THIS]) is None
+    (values,) = compare.differences_of([other, THIS, THIS, other]).values()
+    assert values[0] == values[3] != values[1] == values[2]
+    assert words.endswith(f" {values[0]} and {values[1]}")
+    told = f"Stages of this run were made with different {words}."
+    assert compare.several_origins([other, dated, other]) == told
