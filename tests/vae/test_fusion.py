@@ -5,6 +5,7 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from exact_filter import CLASSES
 from plain import decode, encode, looks, random_params
 
 from jaxsense.config import JmvaeConfig
@@ -58,9 +59,6 @@ def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
         for weight, x, read in zip((2.0, 0.5), given, decoded, strict=True):
             expected += 0.0 if x is None else 0.5 * weight * np.sum((x - read) ** 2)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
 
 
 def test_in_place_the_class_shown_is_not_one_that_the_belief_rules_out():
