@@ -47,6 +47,8 @@ def place(tmp_path, monkeypatch):
         "float": b'{"seed": 1.0}',
         "field": b'{"config": {"dqn": {"epoch": 3}}}',
         "unknown": b'{"colour": 3}',
+        "preset": b'{"preset": "x"}',
+        "smoke": b'{"preset": "smoke"}',
         "sensor": b'{"config": {"sensors": {"x": {"make": "a:b"}}}}',
     }
     for name, text in texts.items():
@@ -86,6 +88,8 @@ TRAIN = [
     (["--config", "nan.json"], "jmvae.beta = nan: must be a number"),
     (["--config", "float.json"], "seed = 1.0: must be a whole number"),
     (["--config", "field.json"], "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
+    (["--config", "preset.json"], "preset = 'x': must be one of default, paper"),
+    (["--config", "smoke.json", "--preset", "paper"], "has a preset; omit --preset"),
     (["--config", "unknown.json"], "colour = 3: unknown field of a run's config.json"),
     (["--config", "sensor.json"], "sensors.x = {'make': 'a:b'}: missing setting attribute"),
     (["--resume", "full"], "resume = 'full': is not a run directory: it has no config.json"),

@@ -284,6 +284,18 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
     check_saved(tmp_path, 4, done=2)
 
 
+def test_a_training_that_fails_says_if_it_could_not_be_kept(tmp_path, monkeypatch):
+    def run(chunk):
+        raise StageError("jmvae: loss = nan")
+
+    def save(*_):
+        raise OSError(28, "No space left")
+
+    monkeypatch.setattr(Checkpoints, "save", save)
+    with pytest.raises(StageError, match=r"loss = nan; cannot save the last .*No space left"):
+        go_on(tmp_path, 4, run)
+
+
 def test_a_killed_training_loses_no_more_than_a_minute(tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr(pipeline, "time", SimpleNamespace(monotonic=lambda: clock[0]))

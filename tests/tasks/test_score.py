@@ -132,6 +132,11 @@ def test_a_score_of_one_seed_shows_no_interval():
         "  optimal: 1.000",
         "  naive: 0.250",
     ]
+    # Where no optimum is known, the best rule takes its place.
+    rules = {"nearest": np.array([0.25]), "auction": np.array([0.75])}
+    team = tasks.Score("team-v0", "team", returns, rules, False)
+    assert (team.best, team.fraction_of_optimal.value) == ("auction", pytest.approx(2 / 3))
+    assert str(team).splitlines()[1] == "  fraction of the best rule, auction: 0.667"
     two = {name: np.repeat(found, 2) for name, found in references.items()}
     shown = str(tasks.Score(NAME, "camera", np.repeat(returns, 2), two, True)).splitlines()
     assert shown[0] == f"{NAME}, camera, 2 seeds: return 0.500 (0.500 to 0.500)"

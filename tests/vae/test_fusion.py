@@ -47,6 +47,11 @@ def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others():
             assert_same(belief, encode(params, model, tuple(inputs)))
 
 
+def test_looks_add_up_in_a_filter_alone():
+    assert fusion.Filter.accumulates
+    assert not fusion.InPlace.accumulates
+
+
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
     params, shown = random_params(jmvae.init, TWO), looks(TWO)
     config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))

@@ -181,6 +181,16 @@ def test_a_point_belongs_to_the_nearest_centre():
     np.testing.assert_array_equal(leave_one_out.nearest(points, centres), [0, 1, 1])
 
 
+def test_the_centres_of_several_tries_are_those_nearest_to_the_points():
+    # Nine clusters of ten points each, of which a single try misses some.
+    places = np.array([[x, y] for x in (0.0, 4.0, 8.0) for y in (0.0, 1.0, 9.0)])
+    points = np.repeat(places, 10, axis=0) + 0.1 * RNG.normal(size=(90, 2))
+    found = jax.jit(leave_one_out.centres, static_argnums=2)(KEY, jnp.float32(points), 9)
+    means = points.reshape(9, 10, 2).mean(axis=1)
+    apart = np.linalg.norm(means[:, None] - np.asarray(found)[None], axis=-1)
+    np.testing.assert_allclose(apart.min(axis=1), 0.0, atol=1e-3)
+
+
 def test_no_two_classes_are_one_cluster():
     members, classes = jnp.array([0, 0, 0, 0, 0, 1, 2]), jnp.array([0, 0, 0, 1, 1, 2, 2])
     # Most of both are in the first cluster; it has three points of the first class.
