@@ -8,7 +8,7 @@ from summaries import EVALUATION, RESULTS, SUMMARY
 
 from jaxsense.config import ConfigError
 from jaxsense.summary import compare
-from jaxsense.summary.read import read_evaluations, read_made, read_summary
+from jaxsense.summary.read import read_evaluations, read_origins, read_summary
 
 
 def written(path, content, name="summary.json"):
@@ -71,12 +71,12 @@ def test_a_summary_of_several_seeds_holds_intervals(tmp_path):
 def test_a_run_that_is_not_finished_has_no_summary(tmp_path):
     with pytest.raises(ConfigError, match=r"is not finished: it has no summary\.json; continue it"):
         read_summary(tmp_path)
-    assert read_made(tmp_path) == []
+    assert read_origins(tmp_path) == []
     assert read_evaluations(tmp_path) == {}
     written(tmp_path, EVALUATION, "evaluations/a.json")
     assert read_evaluations(tmp_path) == {"a": EVALUATION}
-    made = [{**EVALUATION["origin"], "stage": "jmvae"}]
-    assert read_made(written(tmp_path, made, "origins.json")) == made
-    for read, name in ((read_made, "origins.json"), (read_evaluations, "evaluations/a.json")):
+    made = [EVALUATION["origin"]]
+    assert read_origins(written(tmp_path, made, "origins.json")) == made
+    for read, name in ((read_origins, "origins.json"), (read_evaluations, "evaluations/a.json")):
         with pytest.raises(ConfigError, match=f"must hold the {name} of a finished run"):
             read(written(tmp_path, [{"stage": 1}], name))
