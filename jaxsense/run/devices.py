@@ -283,10 +283,9 @@ def join(
     """
     given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
     if coordinator is None or number is None or index is None:
-        there = {name: value for name, value in given.items() if value is not None}
-        missing = " and ".join(f"--{x.replace('_', '-')}" for x in given if x not in there)
-        for name, value in there.items():
-            raise ConfigError(name, value, f"also needs {missing}")
+        missing = [f"--{name.replace('_', '-')}" for name, x in given.items() if x is None]
+        for name in (name for name, x in given.items() if x is not None):
+            raise ConfigError(name, given[name], f"also needs {' and '.join(missing)}")
         return
     host, _, port = coordinator.rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):

@@ -3,14 +3,12 @@
 import contextlib
 import dataclasses
 import functools
-import io
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
-from typing import cast
 
 import jax
 import numpy as np
@@ -18,7 +16,6 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.options import parse_json
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import inside
 from jaxsense.models import Models
@@ -33,7 +30,7 @@ from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
 _METRICS = "metrics.jsonl"
-_MOST_METRICS, _MOST_METRICS_LINE = 2**28, 2**16  # bytes
+_MOST_METRICS = 2**28  # bytes
 
 
 class RunDirectory:
@@ -48,7 +45,6 @@ class RunDirectory:
     def __init__(self, path: Path, settings: Settings):
         self.path, self.settings = path, settings
         self.checkpoints = Checkpoints(path / "checkpoints")
-        self._reported: dict[str, int] = {}
 
     @classmethod
     @contextlib.contextmanager
@@ -90,7 +86,7 @@ class RunDirectory:
         with _locked(path, "resume"):
             run = cls(path, settings)
             run._remove_partial()
-            run._read_metrics()
+            run._mend_metrics()
             yield run
 
     @property
@@ -122,16 +118,8 @@ class RunDirectory:
         return dataclasses.replace(self.settings, seed=seed, num_seeds=1)
 
     def append_metrics(self, *, stage: str, step: int, **metrics: float) -> None:
-        """Adds a line to `metrics.jsonl`, unless this run wrote it before it was killed.
-
-        Args:
-          stage: that reports.
-          step: number of steps so far.
-          **metrics: after that step.
-        """
-        if step > self._reported.get(stage, -1):
-            line = json.dumps({"stage": stage, "step": step, **metrics})
-            files.append(self.path / _METRICS, line)
+        """Adds a line to `metrics.jsonl`: metrics of a stage after so many steps."""
+        files.append(self.path / _METRICS, json.dumps({"stage": stage, "step": step, **metrics}))
 
     def sign(self) -> list[Origin]:
         """Adds this process to `origins.json`, those that have worked on the run; returns all."""
@@ -157,21 +145,14 @@ class RunDirectory:
                 for name in ours:
                     (self.path / name).unlink(missing_ok=True)
 
-    def _read_metrics(self) -> None:
-        """Reads the last step of each stage from `metrics.jsonl`, and cuts off a partial line."""
+    def _mend_metrics(self) -> None:
+        """Cuts off a partial line of `metrics.jsonl`."""
         path = self.path / _METRICS
-        if not os.path.lexists(path):
-            return
-        content = inside.read(path, _MOST_METRICS)
-        whole = content[: content.rfind(b"\n") + 1]
-        # Always, to find out at once whether the run can be written; and where the file is a link,
-        # lines go to a new one.
-        files.write(path, whole)
-        for line in io.BytesIO(whole):
-            with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
-                found = cast(dict, parse_json(line[:_MOST_METRICS_LINE]))
-                stage, step = found["stage"], int(found["step"])
-                self._reported[stage] = max(step, self._reported.get(stage, -1))
+        if os.path.lexists(path):
+            content = inside.read(path, _MOST_METRICS)
+            # Always, to find out at once whether the run can be written; and where the file is a
+            # link, lines go to a new one.
+            files.write(path, content[: content.rfind(b"\n") + 1])
 
 
 def dated(name: str) -> Path:

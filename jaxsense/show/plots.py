@@ -22,7 +22,6 @@ from jaxsense.show.colours import (
     modality_colour,
     plane,
     policy_colour,
-    policy_marker,
 )
 from jaxsense.summary.blocks import (
     AGENTS,
@@ -272,8 +271,9 @@ def policies(block: Missions) -> Figure:
         for y, name in enumerate(names):
             case = cast(dict[str, Number], played[name])
             error = _error(case[key], cast(dict, case.get("intervals", {})).get(difference))
-            style = {"fmt": policy_marker(name), "color": policy_colour(name), "capsize": 3}
-            ax.errorbar(mean(case[key]), y, xerr=error, **style)
+            ax.errorbar(
+                mean(case[key]), y, xerr=error, fmt="o", color=policy_colour(name), capsize=3
+            )
         ax.set(xlabel=MISSIONS[key].label, ylim=(-0.7, len(names) - 0.3))
         ax.set_xlim(0, 1.05 * ax.dataLim.x1)
         ax.grid(axis="x", alpha=0.3)
