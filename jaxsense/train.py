@@ -23,6 +23,7 @@ from jaxsense.config.options import Name, command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, rundir
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.output import on_interrupt, say
@@ -208,9 +209,9 @@ def _train(
         if not arguments.quiet:
             say("Saving and stopping. Press Ctrl-C again to quit immediately.")
 
-    compiled = pipeline.compiled(config, monitor, workers, kept, len(left), policies)
     try:
-        with on_interrupt(stop), compiled as programs:
+        with on_interrupt(stop), Compiler(monitor, kept) as compiler:
+            programs = Programs(config, compiler, workers, len(left), policies)
             for seed, path in left:
                 with run.of_seed(seed, path) as of_seed:
                     if reason := _train_one(arguments, of_seed, programs, monitor, console):

@@ -229,7 +229,7 @@ def options_of(base: object, name: str = "--", path: str = "") -> Iterator[Optio
 class _Parser(argparse.ArgumentParser):
     """Parser of some options, by section."""
 
-    def __init__(self, options: Iterable[Option], **texts: str):
+    def __init__(self, options: Iterable[Option], **texts: Any):
         form = functools.partial(argparse.HelpFormatter, max_help_position=6)
         super().__init__(add_help=False, allow_abbrev=False, formatter_class=form, **texts)
         groups: dict[str, argparse._ArgumentGroup] = {}

@@ -1,11 +1,9 @@
 """Options and files that cannot be used: one line, status 2, and nothing is changed."""
 
 import ast
-import contextlib
 import time
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
@@ -184,8 +182,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    compiled = SimpleNamespace()
-    monkeypatch.setattr(pipeline, "compiled", lambda *_: contextlib.nullcontext(compiled))
+    monkeypatch.setattr(train, "Programs", lambda *_: None)
     monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
     with pytest.raises(SystemExit) as stop:

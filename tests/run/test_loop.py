@@ -15,6 +15,7 @@ import pytest
 
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, pipeline, programs
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import run_chunks
@@ -56,8 +57,8 @@ def toy(replace_training, tmp_path):
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
         checkpoints = Checkpoints(path, warned.append)
-        with pipeline.compiled(SMOKE, monitor) as compiled:
-            found = pipeline.train(KEY, SMOKE, compiled, monitor, checkpoints)
+        with Compiler(monitor) as compiler:
+            found = pipeline.train(KEY, SMOKE, Programs(SMOKE, compiler), monitor, checkpoints)
         return found, [report for report in heard if report[2]], warned
 
     return train
@@ -147,7 +148,8 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_tra
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
     replace_training(lambda drive: [drive(stage) for stage in kinds])
     monitor = Monitor()
-    with pipeline.compiled(SMOKE, monitor, trainings=2) as compiled:
+    with Compiler(monitor) as compiler:
+        compiled = Programs(SMOKE, compiler, trainings=2)
         shared = compiled.of(kinds[0])
         assert shared is compiled.of(kinds[1])
         every = [shared.advance, compiled.of(kinds[2]).finish]
