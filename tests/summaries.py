@@ -83,23 +83,10 @@ FOUND = {
     "information": np.array([5.0, 6.0]),
     "reason": np.array([1, 2]),
 }
-THIS = {
-    "versions": {"jaxsense": "0.4.0", "python": "3.11.7", "jax": "0.10.2"},
-    "devices": ["cpu"],
-    "cores": 2,
-    "source": "aa",
-    "commit": "bb",
-}
+THIS = {name: x for name, x in ORIGIN.items() if name != "date"}
+# By what differs from it.
 OTHERS = {
-    "code": ({**THIS, "source": "cc"}, "source cc and aa"),
-    "commit": ({**THIS, "commit": "dd"}, "commit dd and bb"),
-    "Python": (
-        {**THIS, "versions": {**THIS["versions"], "python": "3.13.0"}},
-        "python 3.13.0 and 3.11.7",
-    ),
-    "JAX": (
-        {**THIS, "versions": {**THIS["versions"], "jax": "0.11.2"}},
-        "jax 0.11.2 and 0.10.2",
-    ),
-    "processor": ({**THIS, "devices": ["NVIDIA H200"]}, "devices ['NVIDIA H200'] and ['cpu']"),
+    **{name: {**THIS, name: "cc"} for name in ("source", "commit")},
+    **{name: {**THIS, "versions": {**THIS["versions"], name: "9"}} for name in ("python", "jax")},
+    "devices": {**THIS, "devices": ["cpu"]},
 }

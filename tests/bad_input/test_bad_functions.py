@@ -129,6 +129,12 @@ def compare_nothing():
     )
 
 
+def start(w, **inputs):
+    """A mission that begins with some inputs changed."""
+    given = {"classes": w.classes, "policy": 0, "faults": no_faults(SMOKE), **inputs}
+    return begin.start(w.mission, w.models, w.scene, **given)
+
+
 def value_iteration(w, **changed):
     """Values of looks that tell nothing, with some arguments changed."""
     given = {"likelihoods": jnp.zeros((2, 3, 2)), "reward": dqn.Nats(0.1), "config": SMOKE.mdp}
@@ -197,6 +203,11 @@ FUNCTIONS = [
         (lambda w, seed=seed: of_missions(w, seed=seed), f"seed = {seed}: must be a whole number")
         for seed in (-1, 2**32, True, 0.5)
     ),
+    (lambda w: start(w, policy=12), "policy = 12: must be a whole number from 0 to 11"),
+    (lambda w: start(w, policy=-1), "policy = -1"),
+    (lambda w: start(w, classes=BAD), "classes = 7"),
+    (lambda w: start(w, faults=Faults(jnp.full(2, NAN), jnp.zeros(2))), "faults.stops_at = nan"),
+    (lambda w: start(w, faults=Faults(jnp.zeros(2), -jnp.ones(2))), "faults.blind_at = -1.0"),
     (lambda w: is_fault(3), "case = 3: must be str, as from cases"),
     (lambda w: tasks.mean_return(w.key, "map-v0", nop, 0), "episodes = 0"),
     (lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0), "state.seen has the shape (3, 2)"),
@@ -278,6 +289,7 @@ FUNCTIONS = [
     (lambda w: train(w, (3, 4, 2)), "bank has 1 entries: must be 2"),
     (lambda w: train(w, (3, 4, 2), (2, 4, 2)), "bank of lidar has the shape (2, 4, 2)"),
     (lambda w: train(w, *[(3, 4, 2)] * 2, number=NAN), "bank of camera = nan"),
+    (lambda w: train(w, *[(3, 0, 2)] * 2), "rows in the bank of camera = 0"),
     (lambda w: train(w, *[(1, 4, 2)] * 2), "bank has one class with 4 looks: must be two or more"),
     (
         lambda w: train(w, *[(3, 4, 2)] * 2, params=jax.tree.map(lambda x: x * NAN, w.params)),
@@ -391,23 +403,6 @@ def test_64_bits_are_refused_even_if_they_are_switched_on_later(given_world, tmp
                 door()
 
 
-@pytest.mark.parametrize(
-    ("inputs", "expected"),
-    [
-        ({"policy": 12}, "policy = 12: must be a whole number from 0 to 11"),
-        ({"policy": -1}, "policy = -1"),
-        ({"classes": BAD}, "classes = 7"),
-        ({"faults": Faults(jnp.full(2, NAN), jnp.zeros(2))}, "faults.stops_at = nan"),
-        ({"faults": Faults(jnp.zeros(2), -jnp.ones(2))}, "faults.blind_at = -1.0"),
-    ],
-)
-def test_a_mission_refuses(given_world, inputs, expected):
-    team, models = given_world.mission, given_world.models
-    base = {"classes": given_world.classes, "policy": 0, "faults": no_faults(SMOKE)}
-    with pytest.raises(ValueError, match=re.escape(expected)):
-        begin.start(team, models, given_world.scene, **{**base, **inputs})
-
-
 def test_environments_refuse(given_world):
     from jaxsense.interfaces import gymnasium, gymnax
 
@@ -415,6 +410,8 @@ def test_environments_refuse(given_world):
     for number in (0, -1, 1.5, True, "2"):
         with pytest.raises(ValueError, match=r"num_envs = .*: must be a whole number greater"):
             gymnasium.MapVectorEnv(mdp, num_envs=number)
+    with pytest.raises(ValueError, match="render_mode = 'ansi': must be one of"):
+        gymnasium.TaskEnv("map-v0", render_mode="ansi")
     with pytest.raises(ValueError, match="Later"):
         gymnasium.MapVectorEnv(mdp, num_envs=2, autoreset_mode="Later")
     env = gymnasium.MapVectorEnv(mdp, num_envs=2)

@@ -19,7 +19,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import jaxsense
-from jaxsense.config import ConfigError
 from jaxsense.interfaces import gymnasium as ours
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
@@ -75,6 +74,8 @@ def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
 @pytest.mark.parametrize("kind", [list, np.array])
 def test_without_autoreset_only_the_masked_environments_start_again(make, kind):
     env = make(num_envs=3, autoreset_mode="Disabled")
+    with pytest.raises(ResetNeeded, match="before reset"):
+        env.step(np.zeros(3, int))
     env.reset(seed=0)
     before, _, terminations, _, _ = env.step(np.array([NOP, 0, NOP]))
     with pytest.raises(ResetNeeded, match=r"\[0 2\] have ended"):
@@ -155,13 +156,3 @@ def test_pictures_show_what_changes():
     env.reset(seed=3)
     assert env.render().shape == (400, 400, 3)
     assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
-
-
-def test_what_cannot_be_is_told(make):
-    env = make(num_envs=3)
-    with pytest.raises(ResetNeeded, match="before reset"):
-        env.step(np.zeros(3, int))
-    with pytest.raises(ValueError, match="render_mode = 'ansi': must be one of"):
-        ours.TaskEnv("map-v0", render_mode="ansi")
-    with pytest.raises(ConfigError, match="agent = 'sonar': must be one of camera, lidar"):
-        gymnasium.make("jaxsense/map-v0", agent="sonar")

@@ -25,7 +25,7 @@ def begun(path, origin, monkeypatch):
 
 
 def test_all_who_work_on_a_run_sign_it_in_order(tmp_path, monkeypatch):
-    other, _ = OTHERS["code"]
+    other = OTHERS["source"]
     begun(tmp_path / "run", other, monkeypatch)
     for _ in range(2):
         with RunDirectory.resume(tmp_path / "run") as run:
@@ -43,7 +43,7 @@ def test_runs_that_were_not_signed_are_of_unknown_origin(tmp_path, monkeypatch):
     (tmp_path / "run" / "origins.json").unlink()
     with RunDirectory.resume(tmp_path / "run") as run:
         told = compare.several_origins(run.sign())
-    assert "python unknown and 3.11.7" in told
+    assert f"python unknown and {THIS['versions']['python']}" in told
 
 
 @pytest.mark.slow

@@ -124,13 +124,13 @@ def test_the_times_of_seeds_add_up():
     assert means["mission"] == {"x": {"mean": 1.0, "low": 1.0, "high": 1.0}}
 
 
-@pytest.mark.parametrize(("other", "words"), OTHERS.values(), ids=OTHERS)
-def test_origins_differ_in_code_versions_and_machine_and_not_in_days(other, words):
-    dated = {**THIS, "date": "2026-11-28"}
+@pytest.mark.parametrize("name", OTHERS)
+def test_origins_differ_in_code_versions_and_machine_and_not_in_days(name):
+    dated, other = {**THIS, "date": "2026-11-28"}, OTHERS[name]
     assert compare.differences_of([THIS, dated]) == {}
     assert compare.several_origins([dated, THIS, THIS]) is None
-    (values,) = compare.differences_of([other, THIS, THIS, other]).values()
-    assert values[0] == values[3] != values[1] == values[2]
-    assert words.endswith(f" {values[0]} and {values[1]}")
-    told = f"Stages of this run were made with different {words}."
+    (found,) = compare.differences_of([other, THIS, THIS, other]).items()
+    theirs, ours = (str({**x, **x["versions"]}[name]) for x in (other, THIS))
+    assert found == (name, [theirs, ours, ours, theirs])
+    told = f"Stages of this run were made with different {name} {theirs} and {ours}."
     assert compare.several_origins([other, dated, other]) == told

@@ -168,9 +168,3 @@ def test_linear_decoders_have_a_likelihood_in_closed_form(params, present):
     features = tuple(x if m in present else None for m, x in enumerate(FEATURES))
     found = estimate(jax.random.key(1), params, LINEAR, features, WEIGHTS, samples=20_000)
     np.testing.assert_allclose(found, exact(params, present), atol=0.03)
-
-
-def test_a_bank_without_looks_is_refused():
-    empty = tuple(np.zeros((3, 0, 2), np.float32) for _ in TWO.modalities)
-    with pytest.raises(ValueError, match="rows in the bank of camera = 0"):
-        jmvae.train(jax.random.key(0), {}, TWO, empty, SETTINGS)
