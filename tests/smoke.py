@@ -12,6 +12,7 @@ import pytest
 
 from jaxsense import train
 from jaxsense.run.rundir import RunDirectory, _named
+from jaxsense.run.settings import Settings
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 MISSION_KEYS = {
@@ -39,6 +40,14 @@ def save_models(run, models):
     for name, tree in _named(models, run.settings.config).items():
         # What a training finds out is NaN before it.
         run.checkpoints.save(name, jax.tree.map(np.nan_to_num, tree))
+
+
+def written_run(path, config, models=None, **settings):
+    """The directory of a run, which has trained nothing, or some models."""
+    with RunDirectory.create(path, Settings("smoke", 0, config, **settings)) as run:
+        if models is not None:
+            save_models(run, models)
+    return path
 
 
 def error_line(argv, capsys, program=train):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
-from smoke import contents, save_models
+from smoke import contents, written_run
 from untrained import blank
 
 import jaxsense
@@ -16,8 +16,6 @@ from jaxsense import ConfigError, evaluate, export, train
 from jaxsense.run import pipeline
 from jaxsense.run.files import WriteError
 from jaxsense.run.monitor import StageError
-from jaxsense.run.rundir import RunDirectory
-from jaxsense.run.settings import Settings
 
 SECONDS = 10.0
 
@@ -25,10 +23,7 @@ SECONDS = 10.0
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """The directory of a run that trained nothing, without a summary."""
-    path = tmp_path_factory.mktemp("runs") / "run"
-    with RunDirectory.create(path, Settings("smoke", 0, SMOKE)) as created:
-        save_models(created, blank(SMOKE))
-    return path
+    return written_run(tmp_path_factory.mktemp("runs") / "run", SMOKE, blank(SMOKE))
 
 
 @pytest.fixture

@@ -4,12 +4,13 @@ import dataclasses
 import sys
 
 import pytest
+from smoke import written_run
 
 import jaxsense
 from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, ConfigError, SensorConfig
 from jaxsense.run.rundir import RunDirectory
-from jaxsense.run.settings import Settings, read_settings, resumable
+from jaxsense.run.settings import read_settings, resumable
 
 REFUSED = (
     "sensors.thermal.make = 'trap:make': names code that would be run; "
@@ -37,9 +38,7 @@ def change(config):
 @pytest.fixture
 def run(tmp_path):
     """The directory of a run that names the trap."""
-    settings = Settings("smoke", 0, change(PRESETS["smoke"]))
-    with RunDirectory.create(tmp_path / "run", settings) as created:
-        return created.path
+    return written_run(tmp_path / "run", change(PRESETS["smoke"]))
 
 
 READERS = {
@@ -82,8 +81,7 @@ def test_commands_need_an_option(run, command, capsys):
 def test_a_run_whose_reward_is_code_is_refused(tmp_path):
     smoke = PRESETS["smoke"]
     config = dataclasses.replace(smoke, mdp=dataclasses.replace(smoke.mdp, reward="trap:make"))
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
-        path = created.path
+    path = written_run(tmp_path / "run", config)
     with pytest.raises(
         ConfigError, match=r"mdp\.reward = 'trap:make': names code that would be run"
     ):
@@ -99,12 +97,8 @@ def test_what_the_users_own_program_names_needs_none(run, tmp_path):
 
 
 def test_a_seed_of_several_must_have_the_settings_of_all(tmp_path, capsys):
-    settings = Settings("smoke", 3, PRESETS["smoke"], num_seeds=2)
-    with RunDirectory.create(tmp_path / "sweep", settings) as created:
-        path = created.path
-    of_seed = dataclasses.replace(settings, seed=3, num_seeds=1, config=change(settings.config))
-    with RunDirectory.create(path / "seed-3", of_seed):
-        pass
+    path = written_run(tmp_path / "sweep", PRESETS["smoke"], num_seeds=2)
+    written_run(path / "seed-0", change(PRESETS["smoke"]))
     with pytest.raises(SystemExit) as stop:
         train.main(["--resume", str(path), "--cache", "None", "--quiet"])
     assert stop.value.code == 2
