@@ -51,11 +51,13 @@ def written_run(path, config, models=None, **settings):
 
 
 def error_line(argv, capsys, program=train):
-    """Runs a program, which must end with status 2 and one line of error."""
+    """Runs a program, which must end with status 2 and nothing but one line of error."""
     with pytest.raises(SystemExit) as stop:
         program.main(argv)
     assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    told = capsys.readouterr()
+    assert told.out == ""
+    (line,) = told.err.splitlines()
     assert "Traceback" not in line
     return line
 

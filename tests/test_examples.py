@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import written_run
+from smoke import error_line, written_run
 from untrained import blank, untrained
 
 import jaxsense
@@ -100,7 +100,5 @@ def test_a_run_whose_sensor_cannot_be_imported_is_named(tmp_path, capsys, monkey
         config = train.parse([*SMALL, *THERMAL], change).settings.config
         run = written_run(tmp_path / "run", config, blank(config))
     monkeypatch.delitem(sys.modules, "new_modality")
-    with pytest.raises(SystemExit) as stop:
-        evaluate.main([str(run), "--trust"])
-    assert stop.value.code == 2
-    assert "sensors.thermal.make = 'new_modality:thermal': must be" in capsys.readouterr().err
+    line = error_line([str(run), "--trust"], capsys, evaluate)
+    assert "sensors.thermal.make = 'new_modality:thermal': must be" in line

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
-from smoke import contents, written_run
+from smoke import contents, error_line, written_run
 from untrained import blank
 
 import jaxsense
@@ -50,20 +50,14 @@ def place(tmp_path, monkeypatch):
     return tmp_path
 
 
-def refusal(main, argv, place, capsys) -> str:
+def refusal(program, argv, place, capsys) -> str:
     """What a command says that refuses its options: status 2, one line, and nothing changed."""
     before, begin = contents(place), time.perf_counter()
-    with pytest.raises(SystemExit) as stop:
-        main(argv)
+    line = error_line(argv, capsys, program)
     assert time.perf_counter() - begin < SECONDS
-    assert stop.value.code == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.count("\n") == 1
-    assert "Traceback" not in told.err
     assert contents(place) == before
-    check_message(told.err.strip())
-    return told.err
+    check_message(line)
+    return line
 
 
 TRAIN = [
@@ -104,14 +98,14 @@ TRAIN = [
 def test_train_refuses(argv, expected, place, capsys):
     base = [] if {"--config", "--resume", "--preset"} & set(argv) else ["--preset", "smoke"]
     out = [] if {"--out", "--resume"} & set(argv) else ["--out", "run"]
-    assert expected in refusal(train.main, [*base, *out, *argv], place, capsys)
+    assert expected in refusal(train, [*base, *out, *argv], place, capsys)
 
 
 @pytest.mark.parametrize(("section", "name"), NUMBERS[::40])
 @pytest.mark.parametrize("text", ["nan", "x"])
 def test_train_refuses_numbers(section, name, text, place, capsys):
     option = f"--{section}.{name.replace('_', '-')}"
-    line = refusal(train.main, ["--preset", "smoke", "--out", "run", option, text], place, capsys)
+    line = refusal(train, ["--preset", "smoke", "--out", "run", option, text], place, capsys)
     assert line.startswith(f"jaxsense.train: {section}.{name} = ")
 
 
@@ -151,14 +145,14 @@ OTHERS = [
 def test_other_commands_refuse(program, argv, expected, run, place, capsys):
     argv = [str(run) if word == "RUN" else word for word in argv]
     before = contents(run)
-    assert expected in refusal(program.main, argv, place, capsys)
+    assert expected in refusal(program, argv, place, capsys)
     assert contents(run) == before
 
 
 @pytest.mark.parametrize("summary", [b"{}", b"\xff"])
 def test_evaluate_refuses_a_broken_summary(summary, run, capsys):
     (run / "summary.json").write_bytes(summary)
-    told = refusal(evaluate.main, [str(run)], run, capsys)
+    told = refusal(evaluate, [str(run)], run, capsys)
     (run / "summary.json").unlink()
     assert "must hold the summary.json of a finished run" in told
 
@@ -170,7 +164,7 @@ def test_evaluate_refuses_a_broken_summary(summary, run, capsys):
         (WriteError(28, "No space left on device", "x"), "cannot write x: No space left on device"),
         (PermissionError(13, "Permission denied", "x"), "train: x: Permission denied; earlier"),
         (OSError("Orbax, in\ntwo lines"), "train: Orbax, in two lines; earlier checkpoints"),
-        (ConfigError("checkpoint", "x", "is damaged"), "train: checkpoint = 'x': is damaged\n"),
+        (ConfigError("checkpoint", "x", "is damaged"), "train: checkpoint = 'x': is damaged"),
     ],
 )
 def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsys, monkeypatch):
@@ -180,11 +174,7 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     monkeypatch.setattr(train, "Programs", lambda *_: None)
     monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
-    with pytest.raises(SystemExit) as stop:
-        train.main(argv)
-    assert stop.value.code == 2
-    line = capsys.readouterr().err
-    assert line.count("\n") == 1
+    line = error_line(argv, capsys)
     assert expected in line
     assert "--help" not in line
 
