@@ -155,10 +155,10 @@ def score(
     if not policies:
         raise ConfigError("policy", policy, "must be one policy or several")
     seeds = len(policies)
-    keys = [key_of_seed(seed) for seed in range(seeds)]
     players = {id(each): _player(each) for each in policies}
-    pairs = zip(keys, policies, strict=True)
-    returns = [players[id(each)](key, task, episodes) for key, each in pairs]
+    returns = [
+        players[id(each)](key_of_seed(seed), task, episodes) for seed, each in enumerate(policies)
+    ]
     if task.name in TASKS and episodes == EPISODES and seeds <= SEEDS:
         known = np.asarray(task.returns)[:, :seeds]
         references = dict(zip(task.references, known, strict=True))

@@ -83,17 +83,16 @@ class Surveys:
 
 def num_scenes(config: Config) -> tuple[int, int, int, int]:
     """Numbers of scenes to train detectors with, for the bank, to measure on, and empty ones."""
-    num_pois, num_classes = config.arena.num_pois, len(config.arena.classes)
-    num_bank = -(-config.jmvae.samples_per_class * num_classes // num_pois)
-    num_held_out = -(-held_out_per_class(config) * num_classes // num_pois)
+    together, num_pois = config.jmvae.num_together, config.arena.num_pois
     num_train = -(-config.detector.num_scans // num_pois)
-    num_empty = -(-num_train // _SHARE_OF_EMPTY)
-    num_for_starts = num_starts(config) * config.jmvae.num_together
-    parts = num_train, max(num_bank, num_for_starts), num_held_out
+    num_bank, num_held_out = (
+        -(-each * len(config.arena.classes) // num_pois)
+        for each in (config.jmvae.samples_per_class, held_out_per_class(config))
+    )
+    parts = num_train, max(num_bank, num_starts(config) * together), num_held_out
     # Whole groups of scenes that show the same PoIs.
-    together = config.jmvae.num_together
-    num_train, num_bank, num_held_out = (-(-number // together) * together for number in parts)
-    return num_train, num_bank, num_held_out, num_empty
+    training, bank, held_out = (-(-number // together) * together for number in parts)
+    return training, bank, held_out, -(-num_train // _SHARE_OF_EMPTY)
 
 
 def held_out_per_class(config: Config) -> int:
@@ -104,9 +103,8 @@ def held_out_per_class(config: Config) -> int:
 def num_training(config: Config) -> int:
     """Looks by each sensor to train its detector with, in whole groups; the others calibrate it."""
     together, num_pois = config.jmvae.num_together, config.arena.num_pois
-    if together == 1:
-        return config.detector.num_training(num_scenes(config)[0] * num_pois)
-    return together * num_pois * config.detector.num_training(num_scenes(config)[0] // together)
+    group = 1 if together == 1 else together * num_pois
+    return group * config.detector.num_training(num_scenes(config)[0] * num_pois // group)
 
 
 def num_starts(config: Config) -> int:
