@@ -191,8 +191,7 @@ def _place(config: Config) -> str:
 
 def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool]) -> Config:
     """The run's settings with the arena and the team of these missions."""
-    sizes = dataclasses.asdict(arguments.arena)
-    changed = {name: value for name, value in sizes.items() if value is not None}
+    changed = {name: x for name, x in vars(arguments.arena).items() if x is not None}
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import itertools
 import shlex
 import sys
@@ -146,8 +147,9 @@ def parse(
         stored = _stored(argv, change)
         arguments = cli.parse(PROGRAM, Arguments(stored), argv, _COMMON)
         require_playable(arguments.settings.config, policies)
-        if arguments.tensorboard:
-            terminal.require_tensorboard()
+        if arguments.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+            reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
+            raise ConfigError("tensorboard", True, reason)
         if arguments.config is not None and arguments.settings.preset != stored.preset:
             raise ConfigError("config", str(arguments.config), "has a preset; omit --preset")
         if arguments.resume is not None:

@@ -63,7 +63,6 @@ def render(
         trust=" --trust" if config.named_code else "",
         summary=summary,
         remarks=compare.remarks(summary),
-        cards=tables.cards(summary),
         missions=[here, *elsewhere],
         learned=[
             tables.detectors(summary),

@@ -20,7 +20,6 @@ from jaxsense.summary.blocks import (
     Timing,
     mean,
     policies,
-    text,
 )
 
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
@@ -154,26 +153,6 @@ def _percent(value: Number, reference: Number) -> str:
         return "-"
     percent = round(100 * (mean(value) / mean(reference) - 1))
     return f"{percent:+d}\u00a0%" if percent else "="
-
-
-def cards(results: Results) -> list[tuple[str, str, str]]:
-    """The main results: a number, its meaning, and figures to compare it with."""
-    found, played = [], results["mission"]
-    for key, what in (
-        ("observations_per_poi", "looks per PoI"),
-        ("time_s", "median seconds per mission"),
-        ("accuracy", "of PoIs right"),
-    ):
-        number = {name: mean(case[key]) for name, case in played.items()}
-        shown = {name: text(value, MISSIONS[key].digits) for name, value in number.items()}
-        beside = [f"{name} {shown[name]}" for name in ("naive", "random") if name in played]
-        if "latent" in played:
-            found.append((shown["latent"], what, ", ".join(beside)))
-    for modality, agent in results["dqn"].items():
-        if agent["optimal_states"] is not None:  # with an optimum to compare with
-            what = f"of {mean(agent['num_states']):,.0f} states of the map played optimally"
-            found.append((f"{mean(agent['optimal_states']):,.0f}", what, modality))
-    return found
 
 
 def times(results: Results, timing: Timing) -> list[Table]:

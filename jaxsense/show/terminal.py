@@ -1,6 +1,5 @@
 """Shows the progress of a program: on a terminal, as lines, or as event files for TensorBoard."""
 
-import importlib
 import io
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,6 @@ import rich.text
 from rich import progress
 from rich.table import Column
 
-from jaxsense.config import ConfigError
 from jaxsense.core import inside
 from jaxsense.run.output import say
 from jaxsense.show.tables import Table
@@ -108,15 +106,6 @@ def as_text(console: rich.console.Console, table: Table) -> str:
     with console.capture() as captured:
         console.print(drawn)
     return captured.get().removesuffix("\n")
-
-
-def require_tensorboard() -> None:
-    """Raises `ConfigError` unless tensorboardX is installed."""
-    try:
-        importlib.import_module("tensorboardX")
-    except ImportError:
-        reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
-        raise ConfigError("tensorboard", True, reason) from None
 
 
 def tensorboard(path: Path) -> Callable[..., None]:
