@@ -33,17 +33,8 @@ def test_run_directory_holds_everything(smoke_run):
 
 
 def test_summary_keeps_its_contract(smoke_run):
-    found = read_summary(smoke_run)  # which checks the type of each value
+    found = read_summary(smoke_run)  # its types; of most numbers, see `test_same_numbers`
     assert (found["preset"], found["seed"]) == ("smoke", 5)
-    assert set(found["detectors"]) == {"camera", "lidar"}
-    belief, latent = found["belief"], found["jmvae"]
-    assert belief["looks"] == [1, 2, 3, 4, 5, 6]
-    assert all(len(belief[curve]) == 6 for curve in ("nll", "accuracy", "bayes_nll"))
-    assert -1 <= belief["doubt_correlation"] <= 1
-    assert 0 <= latent["readout_error"] <= 0.01
-    for block in ("sigma_norm", "unambiguous", "consistent"):
-        assert set(latent[block]) == {"joint", "camera", "lidar"}
-        assert all(len(values) == 3 for values in latent[block].values())
     for block in found["dqn"].values():
         assert block["num_states"] == 384
         assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset

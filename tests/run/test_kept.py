@@ -204,28 +204,19 @@ def test_programs_of_custom_sensors_are_not_kept(tmp_path):
     assert kept.path == tmp_path / "traced"
 
 
-CACHE = {
-    "jax_compilation_cache_dir": None,
-    "jax_compilation_cache_max_size": -1,
-    "jax_persistent_cache_min_compile_time_secs": 1.0,
-    "jax_persistent_cache_min_entry_size_bytes": 0,
-}
-
-
-@pytest.mark.parametrize("own", [None, "/of/the/user"])
-def test_all_compiled_programs_are_cached_unless_the_user_has_a_cache(tmp_path, own):
-    before = {name: jax.config.values[name] for name in CACHE}
-    given = {**CACHE, "jax_compilation_cache_dir": own}
+def test_all_compiled_programs_are_cached(tmp_path):
+    entry = "jax_persistent_cache_min_"
+    names = [f"jax_compilation_cache_{what}" for what in ("dir", "max_size")]
+    names += [f"{entry}compile_time_secs", f"{entry}entry_size_bytes"]
+    before = [jax.config.values[name] for name in names]
     try:
-        for name, value in given.items():
-            jax.config.update(name, value)
+        jax.config.update(names[0], None)
         compilation.use_cache(tmp_path)
-        found = {name: jax.config.values[name] for name in CACHE}
+        found = [jax.config.values[name] for name in names]
     finally:
-        for name, value in before.items():
+        for name, value in zip(names, before, strict=True):
             jax.config.update(name, value)
-    ours = str(tmp_path / "compiled"), compilation._MAX_BYTES, 0, -1
-    assert found == (given if own else dict(zip(CACHE, ours, strict=True)))
+    assert found == [str(tmp_path / "compiled"), compilation._MAX_BYTES, 0, -1]
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no users")
