@@ -94,7 +94,7 @@ def _play(
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
-        compile_s = compiler.monitor.stopwatch.timing()["stages"]["mission"]["compile_s"]
+        compile_s = compiler.monitor.timing()["stages"]["mission"]["compile_s"]
         return Side(run, run().control_steps, player.batch, compile_s, workers.number)
 
     with contextlib.ExitStack() as stack:

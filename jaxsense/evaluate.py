@@ -120,7 +120,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         done = "written" if isinstance(error, files.WriteError) else "used"
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be {done} ({cli.reason(error)})")
     _print(console, block, arguments.episodes)
-    timing = monitor.stopwatch.timing()
+    timing = monitor.timing()
     seconds = timing["stages"]["mission"]["run_s"]
     rate = found.control_steps / seconds
     say(

@@ -218,7 +218,7 @@ def _train(
                 with run.of_seed(seed, path) as of_seed:
                     if reason := _train_one(arguments, of_seed, programs, monitor, console):
                         failed[seed] = reason
-                monitor.stopwatch.restart()
+                monitor.restart()
     except Stopped:
         _end_stopped(run)
     if len(failed) == run.settings.num_seeds:
@@ -263,7 +263,7 @@ def _train_one(
             return str(error)
         monitor.check_stop()
         header = _header(run, origins)
-        _write(run, {**header, "timing": monitor.stopwatch.timing(), **results}, pictures)
+        _write(run, {**header, "timing": monitor.timing(), **results}, pictures)
     return None
 
 

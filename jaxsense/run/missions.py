@@ -269,7 +269,7 @@ class Player:
                 done[0] += some
                 self._monitor.progress(_STAGE, done[0], total)
 
-        with self._monitor.stopwatch.measure("run_s", _STAGE):
+        with self._monitor.measure("run_s", _STAGE):
             # Loaded models lie on the host, and every chunk would transfer them again.
             if (mesh := self._workers.mesh) is None:
                 models = jax.device_put(models)
