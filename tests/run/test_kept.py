@@ -165,12 +165,15 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
     theirs = [tmp_path / "mine", kept.path / "mine", kept.path / f"stage-{32 * '0'}.stablehlo.txt"]
     for path in theirs:
         path.write_text("precious", encoding="utf-8")
+    left = kept.path / ".a.0123456789abcdef.unfinished"
+    left.write_text("{", encoding="utf-8")
     link = kept.path / f"stage-{32 * '1'}.stablehlo"
     link.symlink_to(theirs[0])
     monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
     assert all(path.exists() for path in (*theirs, link))
+    assert not left.exists()
 
 
 def test_the_source_is_that_of_the_whole_package(tmp_path):

@@ -95,6 +95,7 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
     curves = found.curves["count"]
     np.testing.assert_array_equal(curves["double"], [2, np.nan, 6, 8, 10])
     assert len(curves["seconds"]) == 3
+    assert all(0 < seconds < 100 for seconds in curves["seconds"])
 
 
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):

@@ -118,6 +118,25 @@ def test_who_waits_says_so_and_gives_up(monkeypatch, capsys):
     assert capsys.readouterr().out == "Waiting for the other processes at localhost:1.\n"
 
 
+def test_the_first_process_listens_and_who_cannot_join_says_why(monkeypatch, capsys):
+    asked = []
+    note = lambda *given, **more: asked.append((*given, *more.values()))  # noqa: E731
+    monkeypatch.setattr(jax.distributed, "initialize", note)
+    devices.join("localhost:1", 1, 0, quiet=True)
+    devices.join("localhost:1", 2, 1)
+    timeout = 2 * devices._JOIN_TIMEOUT
+    assert asked[0] == ("localhost:1", 1, 0, "localhost:1", timeout)
+    assert asked[1] == ("localhost:1", 2, 1, None, timeout)
+    assert capsys.readouterr().out.count("Waiting") == 1
+
+    def fail(*_, **__):
+        raise RuntimeError("no such host\nat all")
+
+    monkeypatch.setattr(jax.distributed, "initialize", fail)
+    with pytest.raises(ConfigError, match=r"cannot be joined \(no such host\)$"):
+        devices.join("localhost:1", 2, 1, quiet=True)
+
+
 LISTENS = """
 import socket, sys
 from jaxsense.run import devices

@@ -134,6 +134,8 @@ def test_exact_bayes_reads_the_same_looks():
     error = 4 * np.sqrt(share * (1 - share) / 600) * np.log(2)
     assert np.all(np.abs(found["bayes_nll"] - share * np.log(2)) < error)
     assert np.all(np.diff(found["bayes_nll"]) <= 1e-6)
+    # Where two classes are left, the belief is wider.
+    assert found["doubt_correlation"] > 0.5
 
 
 def test_moment_matching_error_as_worked_by_hand():
