@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsense import sim
-from jaxsense.core.types import Belief, by_place, pytree
+from jaxsense.core.types import Belief, by_place, others, pytree
 
 
 def own_reward(value):
@@ -37,6 +37,10 @@ def test_a_class_that_is_defined_again_runs_its_own_program():
 def test_leaves_are_found_by_their_places():
     tree = {"a": (Belief(1, 2),), "b": {"c": 3}}
     assert by_place(tree) == {"a/0/mean": 1, "a/0/std": 2, "b/c": 3}
+
+
+def test_all_rows_but_one_begin_after_it():
+    np.testing.assert_array_equal(others(jnp.arange(4), 1), [2, 3, 0])
 
 
 def own_sensor(value):

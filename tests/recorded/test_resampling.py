@@ -20,6 +20,7 @@ def degrees(*values):
     ("angles", "ranges", "expected"),
     [
         ([0, 0.1], [1, 1, 1], r"readings have the shape \(3,\): must be one for each of 2 angles"),
+        ([0], [1], "angles of 1 rays: must be of two or more"),
         ([0, np.nan], [1, 1], r"angles = nan: must be from -2 pi to 2 pi \(in radians\?\)"),
         ([-180, 180], [1, 1], "angles = -180: must be from -2 pi to 2 pi"),
     ],
@@ -162,6 +163,15 @@ def test_short_gaps_between_beams_are_closed():
         assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.float32(scan))
     np.testing.assert_array_equal(close_gaps([1.0, inf, inf, 4.0], 1)[1:3], inf)
+
+
+@pytest.mark.parametrize(
+    ("angles", "ranges", "told"),
+    [([0, 90], [1, 1], "angles = 90: must be from"), ([0, 1], [1, 1, 1], "one for each of 2")],
+)
+def test_gaps_between_no_directions_are_refused(angles, ranges, told):
+    with pytest.raises(ValueError, match=told):
+        resampling.close_gaps(np.float64(angles), np.float64(ranges))
 
 
 def close_gaps(ranges, *most):

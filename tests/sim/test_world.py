@@ -47,6 +47,8 @@ def test_viewpoints_face_the_poi_in_range(draws):
     error = np.degrees(believed) - bearing
     assert -1.01 <= error.min() < -0.9
     assert 0.9 < error.max() <= 1.01
+    # Of one another, they tell nothing.
+    assert np.abs(np.corrcoef([distance, bearing, error]) - np.eye(3)).max() < 0.1
 
 
 def test_viewpoints_are_free_and_see_the_whole_poi(draws):

@@ -94,6 +94,18 @@ def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
     assert not np.array_equal(camera[0], camera[1])
 
 
+@pytest.mark.parametrize("steps", [1, 150])
+def test_a_training_takes_as_many_steps_as_it_is_told(steps):
+    bank = tuple(jnp.eye(2)[jnp.array(x)][:, None] for x in ([1, 0, 0], [0, 0, 1]))
+    config = JmvaeConfig(steps=steps, batch=16, learning_rate=0.01, annealing=0.0)
+    train = jax.jit(jmvae.train, static_argnums=2)
+    params, found = train(jax.random.key(0), random_params(jmvae.init, TWO), TWO, bank, config)
+    assert found.shape == (steps,)
+    assert np.isfinite(found).all()
+    assert steps == 1 or found[-9:].mean() < 0.9 * found[:9].mean()
+    assert jax.tree.structure(params) == jax.tree.structure(random_params(jmvae.init, TWO))
+
+
 # The loss, term by term, against the equation written down anew.
 
 MODEL = Jmvae(("camera", "lidar"), (2, 3), latent_size=2, hidden=(8, 5))

@@ -155,6 +155,7 @@ def encoder_of(sharpness=1.0) -> Encoder:
 def test_features_are_probabilities_of_labels_read_from_the_posterior():
     encoder = encoder_of()
     assert encoder.num_labels == 2
+    assert not encoder.presence.measures_distance  # unless it is told so
     left = features(encoder, jnp.array([-1.0]))
     np.testing.assert_allclose(left.sum(), 1.0, rtol=1e-6)
     assert left[0] > 0.99
