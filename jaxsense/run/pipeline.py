@@ -81,7 +81,7 @@ def learn(
     scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
-    beliefs = make.beliefs(outputs["beliefs"])
+    beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
     is_sound = compare.unsound(beliefs) is None
     # Measured of a JMVAE that learns from scans, and of no other.
     grouped = {name: x for name, x in outputs.items() if name == "grouped"}
@@ -113,9 +113,7 @@ def learn(
             for network in (learner(config, n) for n in config.modalities)
         },
         results={
-            "detectors": jax.tree.map(
-                lambda x: np.asarray(x).tolist(), outputs["detector_metrics"]
-            ),
+            "detectors": make.plain(outputs["detector_metrics"]),
             "jmvae": make.jmvae(latent | grouped),
             "belief": beliefs,
             "dqn": {

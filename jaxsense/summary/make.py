@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense.config import Config
 from jaxsense.mission.outcome import REASONS
@@ -20,15 +21,15 @@ _Rewards = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 def jmvae(measured: Mapping[str, object]) -> blocks.Jmvae:
     """The block `jmvae` from arrays under its keys, with shares of looks under `unambiguous`."""
-    block: blocks.Jmvae = jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+    block: blocks.Jmvae = plain(dict(measured))
     for name, shares in block["unambiguous"].items():
         block["unambiguous"][name] = [share > _UNAMBIGUOUS for share in shares]
     return block
 
 
-def beliefs(measured: Mapping[str, jax.Array]) -> blocks.Beliefs:
-    """The block `belief` from arrays under its keys."""
-    return jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+def plain(measured: PyTree) -> PyTree:
+    """Arrays as lists and numbers."""
+    return jax.tree.map(lambda x: np.asarray(x).tolist(), measured)
 
 
 def agent(
