@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -44,7 +43,7 @@ class Arguments:
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     reserve(PROGRAM, arguments.json)
     # A device for each core. Called from another program, the devices may be fixed already.
     with contextlib.suppress(RuntimeError):

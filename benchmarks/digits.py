@@ -9,7 +9,6 @@ import dataclasses
 import importlib.util
 import itertools
 import json
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -226,7 +225,7 @@ class Arguments:
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     try:
         digits = load()
     except ImportError as error:

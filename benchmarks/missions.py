@@ -22,7 +22,7 @@ from jaxsense.run.monitor import Monitor
 _UNIT = "control-steps/s"
 # For each accelerator.
 _MISSIONS, _MISSIONS_OF_MANY = 16384, 8192
-# On a CPU; so many that `evaluate` compiles faster programs, see `ledger.runs_long`.
+# On a CPU; so many that `evaluate` compiles faster programs, see `missions.Player`.
 _OF_CPU, _OF_CPU_OF_MANY = 5632, 1024
 PERIODS_BEFORE = 40
 """Control periods before what is measured under way: 4 s of missions that last 14 s."""
@@ -94,7 +94,7 @@ def _play(
         def run() -> Played:
             return player.play(jax.random.key(1), models, cases, total)
 
-        compile_s = compiler.monitor.stopwatch.timing()["stages"]["mission"]["compile_s"]
+        compile_s = compiler.monitor.timing()["stages"]["mission"]["compile_s"]
         return Side(run, run().control_steps, player.batch, compile_s, workers.number)
 
     with contextlib.ExitStack() as stack:

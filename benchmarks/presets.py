@@ -4,7 +4,6 @@ Cells are ranges over the seeds of a preset.
 """
 
 import dataclasses
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +12,7 @@ from jaxsense.config import ConfigError
 from jaxsense.config.options import Name
 from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli
-from jaxsense.summary.blocks import Results, Summary, cases
+from jaxsense.summary.blocks import Results, Summary
 from jaxsense.summary.read import read_summary
 
 PROGRAM = "benchmarks.presets"
@@ -100,7 +99,7 @@ def _of_missions(policy: str) -> Iterator[Figure]:
     ):
 
         def read(results: Results, key: str = key) -> list[Value]:
-            of_run = cases(results["mission"])
+            of_run = results["mission"]
             return [of_run[policy][key]] if policy in of_run else []
 
         yield Figure(f"`{policy}`: {label}", form, read)
@@ -117,7 +116,7 @@ def table(summaries: Iterable[Summary]) -> str:
         of_seeds = found["seeds"].values() if "seeds" in found else [found]
         presets.setdefault(found["preset"], []).extend(of_seeds)
     seeds = [seed for group in presets.values() for seed in group]
-    policies = dict.fromkeys(name for seed in seeds for name in cases(seed["mission"]))
+    policies = dict.fromkeys(name for seed in seeds for name in seed["mission"])
     figures = [*LEARNED, *(figure for policy in policies for figure in _of_missions(policy))]
     heads = [
         f"`{preset}`, {len(group)} seed{'s' * (len(group) > 1)}"
@@ -144,7 +143,7 @@ class Arguments:
 
 def main(argv: list[str] | None = None) -> None:
     """The program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     try:
         require(bool(arguments.runs), arguments, "runs", "must be at least one directory")
         print(table(map(read_summary, arguments.runs)))

@@ -19,11 +19,10 @@ import numpy as np
 import jaxsense
 from jaxsense import Bank, Config, Models
 from jaxsense.config import as_plain
-from jaxsense.core.types import Samples
-from jaxsense.tasks import PRETRAINED, Task, pretrained, registry
-from jaxsense.tasks.environment import Scaling
-from jaxsense.tasks.pretrained import Origin
-from jaxsense.tasks.task import EPISODES, SEEDS
+from jaxsense.core.types import Samples, by_place
+from jaxsense.tasks import PRETRAINED, Task, registry
+from jaxsense.tasks.registry import Origin
+from jaxsense.tasks.task import EPISODES, SEEDS, Scaling
 from jaxsense.training.comparison import models_of
 
 _KEY = 20261126
@@ -80,10 +79,10 @@ def ship(run: Path) -> list[Path]:
         raise SystemExit(f"{run}: commit {content['commit']}: must be one without changes")
     command = f"python -m jaxsense.train --preset {preset} --seed {seed}"
     made = Origin(command, preset, seed, content["commit"], content["versions"])
-    written = [pretrained.DATA / f"{preset}.npz"]
-    write(written[0], {name: getattr(trained, name) for name in pretrained.PARTS}, config, made)
+    written = [registry.DATA / f"{preset}.npz"]
+    write(written[0], {name: getattr(trained, name) for name in registry.PARTS}, config, made)
     freezing = FREEZINGS.get(preset)
-    file = pretrained.DATA / f"{freezing.name}.npz" if freezing else None
+    file = registry.DATA / f"{freezing.name}.npz" if freezing else None
     if freezing is not None and file is not None and not file.exists():
         there = freezing.change(config)
         look_key, scale_key = jax.random.split(jax.random.key(_KEY))
@@ -140,7 +139,7 @@ def scaling_of(key: jax.Array, task: Task) -> Scaling:
             chances = task.action_mask(state).at[-1].set(False)
             action = jax.random.choice(choice_key, len(chances), p=chances / chances.sum())
             after, _ = task.step(step_key, state, action)
-            return after, task.features(state)
+            return after, task.mdp.features(state.belief, state.team, state.agent)
 
         return jax.lax.scan(look, state, jax.random.split(walk_key, _STEPS))[1]
 
@@ -152,7 +151,7 @@ def scaling_of(key: jax.Array, task: Task) -> Scaling:
 
 def write(file: Path, trees: Mapping[str, Any], config: Config, made: Origin) -> None:
     """Writes trees of arrays, with the settings and the origin of the models."""
-    arrays = {name: np.asarray(leaf) for name, leaf in pretrained.flat(trees).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in by_place(trees).items()}
     about = {"config": as_plain(config), "origin": dataclasses.asdict(made)}
     text = np.array(json.dumps(about, allow_nan=False))
     partial = file.with_suffix(".part.npz")  # a task's file is written once

@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jaxsense
-from jaxsense.config import PRESETS, Config, Shape
-from jaxsense.config.options import about, docs
+from jaxsense.config import PRESETS, Config, Shape, as_plain
+from jaxsense.config.options import about, docs, flat
 from jaxsense.config.section import Section, described, fields_of
 from jaxsense.summary.blocks import BLOCKS
 
@@ -27,8 +27,10 @@ def settings() -> str:
         title, text = f"`{name}`" if name else "Top level", _sentence_case(about(section))
         parts.append(f"## {title}\n\n{text}\n\n{_table_of_section(name, section)}")
     parts.append("## Presets\n\nWhat each preset changes of `default`:\n")
+    default = flat(as_plain(PRESETS["default"]))
     for preset, config in PRESETS.items():
-        if rows := [*_changes("", PRESETS["default"], config)]:
+        changed = {n: x for n, x in flat(as_plain(config)).items() if x != default.get(n)}
+        if rows := [(f"`{name}`", _value(value)) for name, value in changed.items()]:
             table = _table(("setting", "value"), rows)
             parts.append(f"### Preset `{preset}`\n\n{table}")
     return "\n".join(parts)
@@ -53,17 +55,6 @@ def _table_of_section(name: str, section: Section) -> str:
             meaning = docs(type(section))[field]
             rows.append((f"`{full}`{mark}", _value(value), described(kind, limits), meaning))
     return _table(("setting", "default", "allowed", "meaning"), rows)
-
-
-def _changes(name: str, default: Section, other: Section) -> Iterator[tuple[str, str]]:
-    """Settings, and sections in it, in which a section differs from its default."""
-    for field in dataclasses.fields(default):
-        full = f"{name}.{field.name}".lstrip(".")
-        old, new = getattr(default, field.name), getattr(other, field.name)
-        if isinstance(old, Section):
-            yield from _changes(full, old, new)
-        elif old != new:
-            yield f"`{full}`", _value(new)
 
 
 def _value(value: object) -> str:

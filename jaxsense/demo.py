@@ -12,10 +12,8 @@ from jaxsense import mission
 from jaxsense.config import ConfigError
 from jaxsense.config.options import command
 from jaxsense.config.section import Checked, limited
-from jaxsense.models import Models
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
-from jaxsense.run.missions import Played
 from jaxsense.run.monitor import Monitor, StageError
 from jaxsense.run.output import say
 from jaxsense.run.settings import MAX_SEED
@@ -52,10 +50,6 @@ class Arguments(Checked):
     browser: bool = True
     cache: Path | None = cli.CACHE
 
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
-
 
 def main(argv: list[str] | None = None) -> None:
     """Runs the program.
@@ -63,20 +57,24 @@ def main(argv: list[str] | None = None) -> None:
     Args:
       argv: the command line without the program; by default the process's own.
     """
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
     try:
         devices.start(1)
         config, models = load_pretrained(arguments.preset)
-        scenario = mission.make_mission(config)
+        scenario, cases = mission.make_mission(config), mission.cases(config)
         scenario.policy(arguments.policy)
+        played = {name: cases[name] for name in (arguments.policy, _REFERENCE)}
+        scenario = scenario.playing(played)
+        kept = cli.keep_programs(PROGRAM, arguments.cache, config)
         # Before a minute of work.
         with rundir.begun(arguments.out, f"demo-{arguments.preset}") as place:
-            kept = cli.keep_programs(PROGRAM, arguments.cache, config)
             with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
-                played = _play(arguments, scenario, models, compiler)
-            metrics = {name: each.metrics[name] for name, each in played.items()}
-            block = make.missions(scenario, metrics)
+                player = missions.Player(scenario, compiler, len(played))
+                found = player.play(jax.random.key(arguments.seed), models, played, episodes=1)
+            recordings = {f"{name} policy": each for name, each in found.recordings.items()}
+            films = film.draw(config, recordings, models.fusion, scenario.fields_of_view)
+            block = make.missions(config, found.metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"
             text = page.fill(
@@ -84,7 +82,7 @@ def main(argv: list[str] | None = None) -> None:
                 preset=arguments.preset,
                 seed=arguments.seed,
                 other=next(name for name in PRETRAINED if name != arguments.preset),
-                films=[_films(scenario, models, played)],
+                films=[dict(zip(recordings, map(page.drawing, films), strict=True))],
                 averages=_AVERAGES,
                 table=table,
                 sentence=_sentence(arguments.policy),
@@ -100,23 +98,6 @@ def main(argv: list[str] | None = None) -> None:
     say(f"Next: {command('jaxsense tasks')}")
     if arguments.browser and _has_display():
         webbrowser.open_new_tab(path.resolve().as_uri())
-
-
-def _play(
-    arguments: Arguments, scenario: mission.Mission, models: Models, compiler: Compiler
-) -> dict[str, Played]:
-    """A mission of each policy, in the same arena."""
-    names = dict.fromkeys((arguments.policy, _REFERENCE))
-    scenario, key = scenario.playing(names), jax.random.key(arguments.seed)
-    player, cases = missions.Player(scenario, compiler, total=1), mission.cases(scenario.config)
-    return {name: player.play(key, models, {name: cases[name]}, episodes=1) for name in names}
-
-
-def _films(scenario: mission.Mission, models: Models, played: dict[str, Played]) -> dict[str, str]:
-    """Animations of the missions, which last equally long."""
-    recordings = {f"{name} policy": each.recording for name, each in played.items()}
-    films = film.draw(scenario.config, recordings, models.fusion, scenario.fields_of_view)
-    return {name: page.drawing(each) for name, each in zip(played, films, strict=True)}
 
 
 def _sentence(policy: str) -> str:

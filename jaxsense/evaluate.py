@@ -1,14 +1,11 @@
 """`python -m jaxsense.evaluate RUN_DIR`: plays missions with the policies of a finished run."""
 
 import dataclasses
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import jax
-import numpy as np
 import rich.console
 import rich.table
 
@@ -79,10 +76,6 @@ class Arguments(Checked):
     animate: bool = False
     trust: bool = False
 
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
-
 
 def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> None:
     """Runs the program.
@@ -91,8 +84,9 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
       argv: the command line without the program; by default the process's own.
       policies: custom policies by name, to play in addition to `dqn.POLICIES`.
     """
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
+    display = Display(console)
     try:
         arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
@@ -101,70 +95,74 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         scenario = mission.make_mission(config, policies)
         played = _cases(arguments, scenario)
         scenario = scenario.playing(case.policy for case in played.values())
+        kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
         # If these files cannot be written, fail now rather than after minutes of work.
         with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
-        kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
-        with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
-            number, times = arguments.episodes * len(played), [time.perf_counter()]
+        number = arguments.episodes * len(played)
+        monitor, key = Monitor(display.show), jax.random.key(arguments.seed)
+        with display, Compiler(monitor, kept) as compiler:
             player = missions.Player(scenario, compiler, number, workers)
-            player.wait()
-            times.append(time.perf_counter())
-            key = jax.random.key(arguments.seed)
             found = player.play(key, models, played, arguments.episodes)
-            times.append(time.perf_counter())
-        block = make.missions(scenario, found.metrics)
-        fields = scenario.fields_of_view
-
-        def draw(title: str) -> str:
-            return film.draw(config, {title: found.recording}, models.fusion, fields)[0]
-
-        written = _write(arguments, trained, config, block, draw)
+        block, written = make.missions(config, found.metrics), []
+        if arguments.animate:
+            (name, recording), *_ = found.recordings.items()
+            title, stem = _film(arguments, trained, config, name)
+            (text,) = film.draw(config, {title: recording}, models.fusion, scenario.fields_of_view)
+            path = arguments.run / f"{stem}.svg"
+            files.write(path, text)
+            written.append(f"The first mission of {name} is in {path}.")
+        written.append(_write(arguments, trained, config, block))
     except (ConfigError, StageError) as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
         done = "written" if isinstance(error, files.WriteError) else "used"
         cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be {done} ({cli.reason(error)})")
     _print(console, block, arguments.episodes)
-    compilation, seconds = np.diff(times)
+    timing = monitor.timing()
+    seconds = timing["stages"]["mission"]["run_s"]
     rate = found.control_steps / seconds
     say(
-        f"{number} missions in {seconds:.1f} s after {compilation:.0f} s of compilation: "
-        f"{rate:.0f} control steps/s, "
-        f"{rate * CONTROL_PERIOD / TIMESTEP:.0f} physics steps/s"
+        f"{number} missions in {seconds:.1f} s after {timing['total_s'] - seconds:.0f} s of "
+        f"compilation: {rate:.0f} control steps/s, {rate * CONTROL_PERIOD / TIMESTEP:.0f} physics "
+        "steps/s"
     )
     for line in written:
         say(line)
 
 
-def _write(
-    arguments: Arguments,
-    trained: Config,
-    config: Config,
-    missions: blocks.Missions,
-    draw: Callable[[str], str],
-) -> list[str]:
-    """Writes an evaluation, its page and, if requested, the film; returns lines about them."""
-    run, cases, written = arguments.run, blocks.cases(missions), []
-    if arguments.animate:
-        name, elsewhere = next(iter(cases)), f"-{_place(config)}"
-        title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
-        if config == trained:
-            title, elsewhere = f"{name} policy, seed {arguments.seed}", ""
-        path = run / f"mission-{name}-{arguments.seed}{elsewhere}.svg"
-        files.write(path, draw(title))
-        written.append(f"The first mission of {name} is in {path}.")
-    for case in cases.values():
+def _film(arguments: Arguments, trained: Config, config: Config, name: str) -> tuple[str, str]:
+    """Title of the film of a case, and the name of its file."""
+    stem = f"mission-{name}-{arguments.seed}"
+    if config == trained:
+        return f"{name} policy, seed {arguments.seed}", stem
+    title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
+    return title, f"{stem}-{_place(config)}"
+
+
+def _write(arguments: Arguments, trained: Config, config: Config, missions: blocks.Missions) -> str:
+    """Writes an evaluation and the run's page; returns a line about them."""
+    run, origin = arguments.run, rundir.origin()
+    for case in missions.values():
         case["seed"] = arguments.seed
     stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
     with files.locked(run, on_wait=say):
         # Another policy may have played in the same arenas before; by other code, it stands apart.
         others = read_evaluations(run)
+        apart = {
+            name: compare.differences_of([other.get("origin", compare.UNKNOWN), origin])
+            for name, other in others.items()
+        }
         names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
-        name = next(name for name in names if name not in others or _is_alike(others[name]))
-        merged = {**(others[name]["mission"] if name in others else {}), **missions}
-        found = _evaluation(config, compare.compared(merged), rundir.origin())
+        name = next(name for name in names if not apart.get(name))
+        found: blocks.Evaluation = {
+            "num_pois": config.arena.num_pois,
+            "side": config.arena.side,
+            "robots": list(config.carried),
+            "origin": origin,
+            "mission": {**(others[name]["mission"] if name in others else {}), **missions},
+        }
         path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
@@ -172,39 +170,16 @@ def _write(
             plot = plots.policies(found["mission"])
             files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
-    return [*written, f"The metrics are in {path}, and with all others in {report}."]
+    return f"The metrics are in {path}, and with all others in {report}."
 
 
 def _report(run: Path, config: Config) -> Path:
-    """Writes the page of a run and `teams.svg`; raises `ConfigError` if its figures are wrong."""
+    """Writes the page of a run; raises `ConfigError` if its figures are wrong."""
     own, found, path = read_summary(run), read_evaluations(run), run / "report.html"
     if own.get("seeds"):
         raise ConfigError("run", str(run), "holds several seeds; choose one")
-    made = [_evaluation(config, own["mission"], own), *found.values()]
-    places = [each for each in made if _is_alike(each)]
-    if len({(each["num_pois"], each["side"], *each["robots"]) for each in places}) > 1:
-        files.write(run / "teams.svg", drawing.svg(plots.places(places)))
     files.write(path, page.render(run, config, own, found))
     return path
-
-
-def _evaluation(
-    config: Config, missions: blocks.Missions, origin: blocks.Origin
-) -> blocks.Evaluation:
-    """Missions with their arena, their team and what made them."""
-    arena = config.arena
-    return {
-        "num_pois": arena.num_pois,
-        "side": arena.side,
-        "robots": list(config.carried),
-        "origin": origin,
-        "mission": missions,
-    }
-
-
-def _is_alike(found: blocks.Evaluation) -> bool:
-    """Whether missions were made as this process makes them, be it on another day."""
-    return not compare.differences_of([found.get("origin", compare.UNKNOWN), rundir.origin()])
 
 
 def _place(config: Config) -> str:
@@ -216,8 +191,7 @@ def _place(config: Config) -> str:
 
 def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool]) -> Config:
     """The run's settings with the arena and the team of these missions."""
-    sizes = dataclasses.asdict(arguments.arena)
-    changed = {name: value for name, value in sizes.items() if value is not None}
+    changed = {name: x for name, x in vars(arguments.arena).items() if x is not None}
     arena = dataclasses.replace(config.arena, **changed)
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):
@@ -253,9 +227,8 @@ def _print(console: rich.console.Console, missions: blocks.Missions, episodes: i
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
             say(as_text(console, table))
-    if verdict := compare.verdict(blocks.cases(missions)):
+    if verdict := compare.verdict(missions):
         say(verdict)
-    say(compare.detection_sizes(missions))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ import io
 import json
 import math
 import os
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -38,7 +37,7 @@ from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
-from jaxsense.tasks.pretrained import PREFIX
+from jaxsense.tasks.registry import PREFIX
 from jaxsense.vae.jmvae import Jmvae
 
 PROGRAM = "jaxsense.export"
@@ -318,7 +317,7 @@ class Arguments(Checked):
 
 def main(argv: list[str] | None = None) -> None:
     """Runs the program."""
-    arguments = cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    arguments = cli.parse(PROGRAM, Arguments, argv)
     run, path = arguments.run, arguments.out
     is_run = run.exists() or not str(run).startswith(PREFIX)
     try:

@@ -90,7 +90,6 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
     `Mdp.of` gives the robot another sensor.
 
     Args:
-      config: all settings.
       models: from `jaxsense.load` or `jaxsense.init`.
       looks: how to look at PoIs, for example `Bank(jaxsense.detections(...))`; `Live` by default,
         so that every look casts a scan in the environment's own arena.
@@ -267,9 +266,6 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     """Features of simulated looks at every class, for a `Bank`.
 
     Args:
-      key: random key.
-      config: all settings.
-      models: whose detectors to use.
       samples: S, looks at each class by each sensor.
 
     Raises:

@@ -1,7 +1,5 @@
 """`jaxsense tasks`: the frozen tasks, and what known policies reach in them."""
 
-import sys
-
 import numpy as np
 import rich.console
 
@@ -32,7 +30,7 @@ def main(argv: list[str] | None = None) -> None:
     Args:
       argv: the command line without the program; by default the process's own.
     """
-    cli.parse(PROGRAM, Arguments, sys.argv[1:] if argv is None else argv)
+    cli.parse(PROGRAM, Arguments, argv)
     try:
         devices.start(1)
     except ConfigError as error:

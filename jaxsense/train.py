@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import itertools
 import shlex
 import sys
@@ -19,10 +20,11 @@ import rich.console
 import rich.table
 
 from jaxsense.config import PRESETS, Config, ConfigError
-from jaxsense.config.options import Name, OptionError, command, read_some
+from jaxsense.config.options import Name, command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
-from jaxsense.run import cli, devices, files, output, pipeline, processes, rundir
+from jaxsense.run import cli, devices, files, output, pipeline, rundir
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.output import on_interrupt, say
@@ -32,8 +34,8 @@ from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import tables, terminal
 from jaxsense.show.terminal import Display, as_text
 from jaxsense.summary import blocks, compare
-from jaxsense.summary.blocks import Header, Made
-from jaxsense.summary.read import read_made, read_summary
+from jaxsense.summary.blocks import Header, Origin
+from jaxsense.summary.read import read_origins, read_summary
 
 PROGRAM = "jaxsense.train"
 
@@ -81,10 +83,6 @@ class Arguments(Checked):
     process_index: int | None = None
     cache: Path | None = cli.CACHE
 
-    def check(self) -> None:
-        """Checks the directory of compiled programs; raises `ConfigError`."""
-        cli.require_directory("cache", self.cache)
-
 
 def main(
     argv: list[str] | None = None,
@@ -108,14 +106,14 @@ def main(
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
             run.check_seeds()
-            processes.join(
+            devices.join(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
                 quiet=is_quiet,
             )
             _train(arguments, run, monitor, console, policies)
-        processes.leave()
+        devices.leave()
     except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     except OSError as error:
@@ -147,10 +145,11 @@ def parse(
     """
     try:
         stored = _stored(argv, change)
-        arguments = cli.parse(PROGRAM, Arguments, argv, Arguments(stored), _COMMON)
+        arguments = cli.parse(PROGRAM, Arguments(stored), argv, _COMMON)
         require_playable(arguments.settings.config, policies)
-        if arguments.tensorboard:
-            terminal.require_tensorboard()
+        if arguments.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+            reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
+            raise ConfigError("tensorboard", True, reason)
         if arguments.config is not None and arguments.settings.preset != stored.preset:
             raise ConfigError("config", str(arguments.config), "has a preset; omit --preset")
         if arguments.resume is not None:
@@ -160,20 +159,20 @@ def parse(
                 raise ConfigError("resume", resume, reason)
             if arguments.settings != stored:
                 raise ConfigError("resume", resume, "resumes in its own settings; omit others")
-    except (ConfigError, OptionError) as error:
+    except ConfigError as error:
         cli.fail(PROGRAM, str(error))
     return arguments
 
 
 def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     """The settings that the other options change, needed before those are read."""
-    given = read_some(Arguments, argv, ("--resume", "--config", "--trust", "--preset"))
-    is_trusted = given.get("--trust") is True
-    if isinstance(resume := given.get("--resume"), Path):
+    values, _ = given(Arguments, argv)
+    is_trusted = values.get("trust") is True
+    if isinstance(resume := values.get("resume"), Path):
         return resumable(resume, is_trusted)
-    if isinstance(file := given.get("--config"), Path):
+    if isinstance(file := values.get("config"), Path):
         return read_settings(file, is_trusted)
-    preset = str(given.get("--preset", "default"))
+    preset = str(values.get("settings.preset", "default"))
     if preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
     return Settings(preset, 0, change(PRESETS[preset]))
@@ -205,21 +204,21 @@ def _train(
     workers = devices.start(arguments.devices)
     kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
     is_left = np.array([not (path / "summary.json").exists() for path in run.seeds.values()])
-    left = [*itertools.compress(run.seeds.items(), processes.of_first_process(is_left))]
+    left = [*itertools.compress(run.seeds.items(), devices.of_first_process(is_left))]
 
     def stop() -> None:
         monitor.stop()
         if not arguments.quiet:
             say("Saving and stopping. Press Ctrl-C again to quit immediately.")
 
-    compiled = pipeline.compiled(config, monitor, workers, kept, len(left), policies)
     try:
-        with on_interrupt(stop), compiled as programs:
+        with on_interrupt(stop), Compiler(monitor, kept) as compiler:
+            programs = Programs(config, compiler, workers, len(left), policies)
             for seed, path in left:
                 with run.of_seed(seed, path) as of_seed:
                     if reason := _train_one(arguments, of_seed, programs, monitor, console):
                         failed[seed] = reason
-                monitor.stopwatch.restart()
+                monitor.restart()
     except Stopped:
         _end_stopped(run)
     if len(failed) == run.settings.num_seeds:
@@ -237,7 +236,7 @@ def _end_stopped(run: RunDirectory) -> NoReturn:
         again += " with the same processes" if jax.process_count() > 1 else ""
         output.complain(f"Stopped; all training so far is saved. To resume: {again}")
     # Other processes may be blocked in a collective; wait only briefly.
-    processes.leave(processes.LEAVE_TIMEOUT)
+    devices.leave(devices.LEAVE_TIMEOUT)
     sys.exit(output.INTERRUPTED)
 
 
@@ -252,7 +251,8 @@ def _train_one(
     records = [run.append_metrics]
     if arguments.tensorboard:
         records.append(terminal.tensorboard(run.path / "tensorboard"))
-    if several := compare.several_origins(run.made("mission")):
+    origins = run.sign()
+    if several := compare.several_origins(origins):
         _warn(f"{run.path}: {several}")
     with Display(console, records, quiet=arguments.quiet) as display:
         monitor.begin(display.show)
@@ -262,8 +262,8 @@ def _train_one(
             _warn(f"{error}; earlier checkpoints are in {run.path}")
             return str(error)
         monitor.check_stop()
-        header = _header(run, run.sign("mission"))
-        _write(run, {**header, "timing": monitor.stopwatch.timing(), **results}, pictures)
+        header = _header(run, origins)
+        _write(run, {**header, "timing": monitor.timing(), **results}, pictures)
     return None
 
 
@@ -286,9 +286,8 @@ def _summarise_seeds(run: RunDirectory, failed: dict[int, str]) -> None:
     """Writes the page, curves and summary of several seeds, without failed ones."""
     paths = [path for seed, path in run.seeds.items() if seed not in failed]
     timing, of_each, means = compare.of_seeds([read_summary(path) for path in paths])
-    made = [(path.name, each) for path in paths for each in read_made(path)]
-    seeds_made: list[Made] = [{**each, "stage": f"{name}: {each['stage']}"} for name, each in made]
-    header = _header(run, [*seeds_made, *run.made("means")])
+    origins = [each for path in paths for each in read_origins(path)]
+    header = _header(run, [*origins, rundir.process()])
     found: blocks.Summary = {**header, "timing": timing, "seeds": of_each, **means}
     if failed:
         found["failed"] = {str(seed): reason for seed, reason in failed.items()}
@@ -312,14 +311,15 @@ def _drawing() -> ModuleType:
 _warn = functools.partial(cli.warn, PROGRAM)
 
 
-def _header(run: RunDirectory, made: list[Made]) -> Header:
-    """A summary's keys about the run itself, with what made its stages if that differs."""
+def _header(run: RunDirectory, origins: list[Origin]) -> Header:
+    """A summary's keys about the run itself, with the origins of its results if they differ."""
     found: Header = {
         "preset": run.settings.preset,
         "seed": run.settings.seed,
         **rundir.origin(),
     }
-    return {**found, "origins": made} if compare.differences_of(made) else found
+    different = [each for i, each in enumerate(origins) if each not in origins[:i]]
+    return {**found, "origins": different} if compare.differences_of(different) else found
 
 
 def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
@@ -332,7 +332,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
         say(as_text(console, table))
-    if verdict := compare.verdict(blocks.cases(found["mission"])):
+    if verdict := compare.verdict(found["mission"]):
         say(verdict)
     for remark in compare.remarks(found):
         say(remark)

@@ -11,7 +11,6 @@ from typing import get_args
 import beartype
 import jaxtyping
 
-from jaxsense.vae.detectors import detect
 from jaxsense.vae.gaussian import kl_divergence
 
 _CONFIG = beartype.BeartypeConf(is_pep484_tower=True)  # an int is a float
@@ -62,15 +61,12 @@ def main() -> None:
 
     jax.eval_shape(play, KEY)
 
-    mdp = jaxsense.make_mdp(TINY, models, jaxsense.Bank((jnp.full((3, 4, 2), 0.5),) * 2))
     look, seen, two = jnp.full(2, 0.5), jnp.zeros(2, bool), jnp.zeros(2)
     models.bayes.update(models.bayes.prior, look, 1)
     models.fusion.update(models.fusion.prior, seen, look, 1)
     wrong = {
         "kl_divergence": lambda: kl_divergence(two, two, jnp.zeros(3), two),
         "log_likelihoods": lambda: models.bayes.log_likelihoods(look[None], 0),
-        "observe": lambda: mdp.looks.observe(KEY, jnp.arange(3), jnp.arange(1), 0),
-        "detect": lambda: detect(models.detectors[0], jnp.zeros((1, 240)), jnp.ones(())),
         "update": lambda: models.fusion.update(models.fusion.prior, two, look, 1),
     }
     refused = {}

@@ -12,6 +12,7 @@ import pytest
 
 from jaxsense import train
 from jaxsense.run.rundir import RunDirectory, _named
+from jaxsense.run.settings import Settings
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 MISSION_KEYS = {
@@ -41,12 +42,22 @@ def save_models(run, models):
         run.checkpoints.save(name, jax.tree.map(np.nan_to_num, tree))
 
 
+def written_run(path, config, models=None, **settings):
+    """The directory of a run, which has trained nothing, or some models."""
+    with RunDirectory.create(path, Settings("smoke", 0, config, **settings)) as run:
+        if models is not None:
+            save_models(run, models)
+    return path
+
+
 def error_line(argv, capsys, program=train):
-    """Runs a program, which must end with status 2 and one line of error."""
+    """Runs a program, which must end with status 2 and nothing but one line of error."""
     with pytest.raises(SystemExit) as stop:
         program.main(argv)
     assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    told = capsys.readouterr()
+    assert told.out == ""
+    (line,) = told.err.splitlines()
     assert "Traceback" not in line
     return line
 

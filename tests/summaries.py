@@ -1,4 +1,6 @@
-"""A whole summary, made up."""
+"""A whole summary, made up, and metrics of two missions."""
+
+import numpy as np
 
 AGENT = {
     "return": 1.2345, "optimal": 1.25, "greedy": 1.24, "naive": 1.0, "random": -1.5,
@@ -13,7 +15,6 @@ CASE = {
     "calibration": {"confidence": 0.9975, "accuracy": 0.9985, "nll": 0.0125},
     "ended": {"finished": 127, "time limit": 1},
 }  # fmt: skip
-BYTES = {"latent": 16.0, "features": 8.0, "raw": 2326.5}
 UNAMBIGUOUS = {"joint": [True] * 3, "camera": [True, False, False], "lidar": [False, True, True]}
 DETECTOR = {"accuracy": 0.9995, "ece": 0.01, "nll": 0.02}
 CURVES = "looks", "nll", "bayes_nll", "accuracy", "bayes_accuracy"
@@ -40,7 +41,7 @@ SUMMARY = {
     },
     "belief": {"doubt_correlation": 0.9375, **{name: [1, 2] for name in CURVES}},
     "dqn": {"camera": AGENT, "lidar": AGENT},
-    "mission": {"latent": CASE, "bytes_per_detection": BYTES},
+    "mission": {"latent": CASE},
 }
 OF_SEEDS = {
     **SUMMARY,
@@ -63,5 +64,29 @@ EVALUATION = {
     "side": 6.0,
     "robots": ["camera", "camera", "lidar"],
     "origin": ORIGIN,
-    "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}, "bytes_per_detection": BYTES},
+    "mission": {"latent": {**CASE, "seed": 7, "accuracy": 0.75}},
+}
+FOUND = {
+    "classes": np.array([[0, 1, 2], [2, 2, 1]]),
+    "is_right": np.array([[True, True, False], [True, True, True]]),
+    "ambiguous": np.array([[False, True, False], [True, True, False]]),
+    # The third PoI of the second mission was never detected: .9, .8, .4, .7 and 1 count.
+    "seen": np.array([[True, True, True], [True, True, False]]),
+    "confidence": np.array([[0.9, 0.8, 0.4], [0.7, 1.0, 0.2]]),
+    "nll": np.array([[0.1, 0.2, 1.5], [0.3, 0.0, 9.0]]),
+    "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
+    "observations_per_poi": np.array([1.0, 2.0]),
+    "time_s": np.array([10.0, 20.0]),
+    "collisions": np.array([0, 2]),
+    "goals": np.array([4, 6]),
+    "goals_reached": np.array([4, 5]),
+    "information": np.array([5.0, 6.0]),
+    "reason": np.array([1, 2]),
+}
+THIS = {name: x for name, x in ORIGIN.items() if name != "date"}
+# By what differs from it.
+OTHERS = {
+    **{name: {**THIS, name: "cc"} for name in ("source", "commit")},
+    **{name: {**THIS, "versions": {**THIS["versions"], name: "9"}} for name in ("python", "jax")},
+    "devices": {**THIS, "devices": ["cpu"]},
 }

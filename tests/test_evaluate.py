@@ -12,7 +12,6 @@ from xml.etree import ElementTree
 
 import jax
 import pytest
-from recordings import FIELDS_OF_VIEW, recording
 from smoke import MISSION_KEYS, error_line
 
 import jaxsense
@@ -21,7 +20,6 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import rundir
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.show import film
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +50,10 @@ def test_evaluate_writes_a_file_of_its_own_and_leaves_the_runs_figures(evaluated
     assert origin == rundir.origin()
     assert origin["devices"] == ["cpu"] * len(jax.devices())
     assert found == {"num_pois": 3, "side": 3.0, "robots": ["camera", "lidar"]}
-    assert set(blocks) == {*dqn.POLICIES, "bytes_per_detection"}
+    assert set(blocks) == {*dqn.POLICIES}
     for policy in dqn.POLICIES:
-        # The policies of an untrained team may be less accurate than naive exploration.
-        compared = {"of_naive"} | ({"intervals"} if policy != "latent" else set())
-        assert set(blocks[policy]) | compared == MISSION_KEYS | {"seed"} | compared
-        assert ("intervals" in blocks[policy]) == (policy != "latent")
+        compared = {"intervals"} if policy != "latent" else set()
+        assert set(blocks[policy]) == MISSION_KEYS | {"seed"} | compared
         assert (blocks[policy]["episodes"], blocks[policy]["seed"]) == (1, 0)
     plot = ElementTree.parse(path / "evaluations" / f"{NAME}.svg")
     assert "PoIs wrong" in "".join(plot.getroot().itertext())
@@ -71,17 +67,13 @@ def copy(evaluated, tmp_path):
 
 
 def write(arguments, missions):
-    config, models = jaxsense.load(arguments.run)
-
-    def draw(title):
-        return film.draw(config, {title: recording()}, models.fusion, FIELDS_OF_VIEW)[0]
-
-    return evaluate._write(arguments, config, config, missions, draw)
+    config, _ = jaxsense.load(arguments.run)
+    return evaluate._write(arguments, config, config, missions)
 
 
 def only(blocks, *names):
     """Some cases, as another evaluation has played them."""
-    return {name: blocks[name] for name in (*names, "bytes_per_detection")}
+    return {name: blocks[name] for name in names}
 
 
 def test_policies_that_play_in_the_same_arenas_share_a_file(copy):
@@ -121,7 +113,7 @@ def test_evaluations_by_others_stand_apart(copy, other):
         write(evaluate.Arguments(copy, episodes=1), only(before["mission"], "nearest"))
     assert json.loads(file.read_text()) == before
     apart = read(copy, f"{NAME}-2")
-    assert set(apart["mission"]) == {"nearest", "bytes_per_detection"}
+    assert set(apart["mission"]) == {"nearest"}
     assert apart["origin"] == origin
     assert len([*(copy / "evaluations").glob("*.json")]) == 2
     titles = re.findall(
@@ -180,14 +172,11 @@ def test_other_robots_play_apart_from_a_runs_own(smoke_run, tmp_path, cache):
     assert (found["num_pois"], found["side"]) == (3, 3.0)
     assert found["robots"] == ["camera", "camera", "lidar"]
     # Of both evaluations.
-    assert set(found["mission"]) == {"nearest", "camera_2_alone", "bytes_per_detection"}
+    assert set(found["mission"]) == {"nearest", "camera_2_alone"}
     assert {"told", "ambiguous_reported"} <= set(found["mission"]["camera_2_alone"])
     drawn = ElementTree.parse(path / "mission-nearest-0-3-points-3-m-2-camera-1-lidar.svg")
     lines = {text.text for text in drawn.iter("{http://www.w3.org/2000/svg}text")}
     assert {"camera 1: choosing", "camera 2: choosing", "lidar: choosing"} <= lines
-    assert "2 camera, 1 lidar" in "".join(
-        ElementTree.parse(path / "teams.svg").getroot().itertext()
-    )
     assert "2 camera, 1 lidar" in (path / "report.html").read_text(encoding="utf-8")
 
 
@@ -199,7 +188,7 @@ def test_a_directory_without_a_finished_run_is_named(tmp_path, capsys):
     with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, PRESETS["smoke"])) as run:
         pass
     line = error_line([str(run.path)], capsys, evaluate)
-    assert "must be a finished run (there is no checkpoint 'detector_camera')" in line
+    assert "detector_camera.msgpack': is missing; must be that of a finished run" in line
 
 
 @pytest.mark.parametrize("program", [evaluate, export])

@@ -1,5 +1,6 @@
 """The two ways of looking, that they see the same, and the MDPs of them."""
 
+import collections
 from dataclasses import replace
 
 import chex
@@ -7,18 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exact_filter import exact_filter
 from untrained import blank, untrained
 
 import jaxsense
 from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
-from jaxsense.core.types import Belief
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import rewards
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
-from jaxsense.vae import fusion, jmvae
+from jaxsense.vae import jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 CONFIG = replace(PRESETS["smoke"], jmvae=JmvaeConfig(hidden=(8,)))
@@ -55,7 +56,7 @@ def test_bank_draws_every_detection_of_the_true_class_and_no_other(modality):
 
 def test_an_mdp_updates_beliefs_by_the_jmvae(models):
     mdp = looks.make_mdp(CONFIG, models, Bank(numbered_bank()))
-    assert (mdp.num_pois, mdp.num_classes, mdp.num_modalities) == (3, 3, 2)
+    assert (mdp.num_pois, mdp.num_classes, mdp.num_modalities, mdp.robots) == (3, 3, 2, (0,))
     seen = jnp.array([[0, 0], [0, 1], [1, 0]], bool)
     reset = jax.jit(mdps.reset)
     state = reset(jax.random.key(1), mdp, jnp.array([2, 0, 1]), seen)
@@ -111,36 +112,50 @@ def test_entropy_by_hand():
 
 
 def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(models):
-    # Green is class 0, red the others. The filter adds the logarithm of the label's probability.
-    classes = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-    prior = fusion.prior(MODEL, 20.0)
-    found = jax.jit(lambda key: fusion.init_filter(key, MODEL, classes, prior, (1,)))(
-        jax.random.key(0)
-    )
-    of_moments = np.linalg.pinv(found.readout.of_classes)
-    kernel = jnp.float32(np.array([[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]) @ of_moments.T)
-    layer = {"kernel": kernel, "bias": jnp.zeros(len(of_moments))}
-    of_each = {m: {"params": {"Dense_0": layer}} for m in MODEL.modalities}
-    found = replace(found, networks=of_each, hidden=())
     config = replace(
         CONFIG,
         jmvae=replace(CONFIG.jmvae, fusion="filter"),
         mdp=replace(CONFIG.mdp, reward="nats", look_cost=0.0625),
     )
-    looks_red = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
-    mdp = looks.make_mdp(config, replace(models, fusion=found), Bank(looks_red))
+    seen = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
+    mdp = looks.make_mdp(config, replace(models, fusion=exact_filter()), Bank(seen))
     state = jax.jit(mdps.reset)(jax.random.key(0), mdp, np.array([1, 1, 1]), np.zeros((3, 2), bool))
 
     @jax.jit
     def look(mdp, state, modality):
         return mdps.step(jax.random.key(0), mdp.of(modality), state, jnp.int32(1))
 
-    # .2 to .8 to .8 after one look, and .04 to .64 to .64 after two.
-    one, two = np.array([1, 4, 4]) / 9, np.array([1, 16, 16]) / 33
+    # Red by .8: .2 to .8 to .8. Then a cylinder by .8: .16 to .64 to .16.
+    one, two = np.array([1, 4, 4]) / 9, np.array([1, 4, 1]) / 6
     entropies = [np.log(3), *(-np.sum(w * np.log(w)) for w in (one, two))]
     for modality, before, after in ((0, *entropies[:2]), (1, *entropies[1:])):
         state, outcome = look(mdp, state, jnp.int32(modality))
         assert outcome.reward == pytest.approx(before - after - 0.0625, abs=1e-4)
+
+
+def test_repeated_looks_are_at_one_poi_from_one_place_or_near_it(monkeypatch):
+    Scene = collections.namedtuple("Scene", ["poses", "classes"])
+
+    def look(key, world, scene, modality, poi, farthest=None):
+        """Where the robot stands after it: at 5 m, or as far from there as it may."""
+        place = jnp.float32(5) if farthest is None else scene.poses[modality, 0] + farthest
+        seen = jnp.stack([place, scene.classes[poi]]), 2.0 * place
+        return seen, scene._replace(poses=scene.poses.at[modality, 0].set(place))
+
+    start = lambda key, world, classes, places: Scene(jnp.zeros((2, 3)), classes)  # noqa: E731
+    monkeypatch.setattr(worlds, "random_scene", start)
+    monkeypatch.setattr(worlds, "look", look)
+    keys, classes = jax.random.split(jax.random.key(0), 400), jnp.tile(jnp.arange(3.0), (400, 1))
+    seen, distances, places = looks.repeats(keys, None, classes, 1, 4)
+    assert (seen.shape, distances.shape, places.shape) == ((400, 4, 2), (400, 4), (400, 4, 2))
+    first, *others = np.moveaxis(np.asarray(places[..., 0]), 1, 0)
+    np.testing.assert_array_equal(first, 5.0)
+    for other in others:
+        np.testing.assert_array_equal(other, others[0])
+    assert set(others[0]) == {5.0, 6.0}
+    assert np.mean(others[0] == 6.0) == pytest.approx(0.5, abs=0.1)
+    np.testing.assert_array_equal(distances, 2 * places[..., 0])
+    np.testing.assert_array_equal(seen[..., 1], 0.0)  # the first PoI's class
 
 
 @pytest.mark.slow

@@ -49,14 +49,6 @@ def test_main_results_stand_beside_what_they_are_compared_with(tmp_path):
     others = {"naive": naive, "random": {**CASE, "accuracy": 0.5, "time_s": 9.0}}
     content = {**SUMMARY, "mission": {**SUMMARY["mission"], **others}}
     text = page.render(tmp_path, CONFIG, content)
-    cards = {
-        "1.68": "naive 2.00, random 1.68",
-        "13.8": "naive 15.0, random 9.0",
-        "0.998": "naive 0.998, random 0.500",
-        "1,700": "camera",
-    }
-    for number, beside in cards.items():
-        assert re.search(f"<li><b>{number}</b><span>[^<]*</span><small>{beside}</small></li>", text)
     assert "By median times, the latent policy is 8 % faster than naive exploration." in text
 
 

@@ -88,12 +88,14 @@ def test_camera_and_lidar_are_drawn_from_left_to_right():
         assert ax.get_ylim() == (0.0, pytest.approx(1.05 * 0.8))
 
 
-def test_classes_that_look_alike_share_a_name_and_every_norm_is_shown():
+def test_every_belief_and_every_norm_is_shown():
     centres = np.array([[2.0, 0.0], [-2.0, 0.0], [-2.0, 0.05]])
     belief = Belief(np.repeat(centres[:, None], 10, axis=1), np.full((3, 10, 2), 0.5))
     figure = plots.latent_space(CONFIG, dict.fromkeys(("joint", "camera", "lidar"), belief))
     axes, below = figure.axes[0], figure.axes[3]
-    assert {text.get_text() for text in axes.texts} == {"green cylinder", "red cylinder\nred cube"}
+    places = [each.get_offsets() for each in axes.collections[1::2]]
+    np.testing.assert_allclose(places, belief.mean)
+    assert [text.get_text() for text in below.get_yticklabels()] == [*CONFIG.arena.classes]
     for c, points in enumerate(each.get_offsets() for each in below.collections):
         np.testing.assert_allclose(points[:, 0], np.sqrt(0.5))
         assert np.abs(points[:, 1] - c).max() < 0.5

@@ -1,7 +1,8 @@
-"""The snippets of `docs/extending.md` and `docs/robot.md` run and do what the pages say."""
+"""Examples of pages and notebooks run, and do and print what the text around them says."""
 
 import dataclasses
 import importlib
+import json
 import re
 import zipfile
 from pathlib import Path
@@ -19,12 +20,13 @@ ROOT = Path(__file__).parent.parent
 
 
 def snippets(page):
-    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    text = (ROOT / page).read_text(encoding="utf-8")
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, *_ = snippets("extending.md")
-PLAYED, RESAMPLED, LOOKS, _, RETRAINED, ARCHIVED = snippets("robot.md")
+PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, *_ = snippets("docs/extending.md")
+PLAYED, RESAMPLED, LOOKS, _, RETRAINED, ARCHIVED = snippets("docs/robot.md")
+INTERFACES = snippets("docs/interfaces.md")
 
 
 @pytest.fixture
@@ -38,6 +40,104 @@ def run(*parts, **names):
     for part in parts:
         exec(part, names)
     return names
+
+
+def test_example_of_the_readme_runs(capsys):
+    names = run(snippets("README.md")[-1])
+    assert capsys.readouterr().out == f"(12,) {names['seen'].reward!s}\n"
+    # A look costs 0.1 nats, and tells at most which of three classes it is: log 3 = 1.10.
+    assert -0.1 <= float(names["seen"].reward) < 1.0
+
+
+DECIMAL = r"-?\d+\.\d+"
+PAGES = [
+    ("getting-started.md", -1, r"\(64, 2\) \(64, 2\)\n"),
+    ("getting-started.md", 0, r"\[.*\]\n"),  # trains as far as the latent space
+    *(("functions.md", i, ".*") for i in range(5)),
+    ("jmvae.md", -1, rf"\(200, 2\) \(200, 2\)\n.* (1\.0|0\.99)\d*\n.* {DECIMAL}\n"),
+    ("tasks.md", 0, ".*"),
+    ("tasks.md", 1, ".*"),
+    ("tasks.md", 2, r"(.*False.*\n)\1"),  # of the observation, and of the state
+    *(("tasks.md", i, ".*noisy-v0, camera, 10 seeds: return.*") for i in (3, 5)),
+    ("tasks.md", 4, r".*\(10,\)\n"),
+    ("tasks.md", 6, ".*mine.*"),
+    ("tasks.md", 7, rf".*map-v0, camera, \d+ seeds?: return {DECIMAL}.*random.*"),
+    ("tasks.md", 8, ".*--preset team --seed 0.*"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "which", "printed"), PAGES)
+def test_examples_of_the_pages_run(page, which, printed, capsys):
+    run(snippets(f"docs/{page}")[which])
+    assert re.fullmatch(printed, capsys.readouterr().out, re.DOTALL)
+
+
+# Of each example of the interfaces' page; those without only make what later ones use.
+NEEDS = (
+    "gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo", "", "gymnax",
+    "gymnasium", "", "jaxmarl", "onnx",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def names():
+    return run(*(part for part, package in zip(INTERFACES, NEEDS, strict=True) if not package))
+
+
+@pytest.mark.slow  # the tests of each interface take the same steps
+@pytest.mark.parametrize(("number", "package"), [(i, n) for i, n in enumerate(NEEDS) if n], ids=str)
+def test_examples_of_interfaces_print_what_they_say(
+    names, number, package, tmp_path, monkeypatch, capsys
+):
+    pytest.importorskip(package, reason=f"{package}: needs the extra that the page names")
+    if package == "stable_baselines3":
+        importlib.import_module("torch").set_num_threads(1)  # more get into each other's way
+    monkeypatch.chdir(tmp_path)
+    if package == "onnx":
+        Path("robot.zip").write_bytes(export.archive(names["config"], names["models"]))
+    run(INTERFACES[number], **names)
+    (printed,) = re.findall(r"^print\(.*\)  # ([^;\n]*)", INTERFACES[number], re.MULTILINE)
+    assert capsys.readouterr().out == f"{printed}\n"
+
+
+NOTEBOOKS = {
+    "tasks": [r"noisy-v0, lidar, 10 seeds: return"],
+    # Both of the uncertain sensors spoke for a red cylinder.
+    "jmvae_and_fusion": [
+        "possible: red cylinder, red cube",
+        "possible: green cylinder, red cylinder",
+        "possible: red cylinder\n",
+    ],
+    "single_functions": [r"0\.50 certain", r"0\.99 certain", "look", r"stop\s*$"],
+    "your_robot": [
+        "is there: True",
+        r"distance 0\.8: True",
+        r"bearing 0\.0, distance 1\.1: False",
+        r"bearing 0\.6, distance 0\.8: False",
+        r"bearing 0\.0, distance 1\.3: False, not known",
+        r"\['green cylinder', 'red cylinder'\]",
+    ],
+}
+
+
+def test_every_example_is_run():
+    assert len(NEEDS) == len(INTERFACES)
+    there = {path.stem for path in (ROOT / "examples" / "notebooks").glob("*.ipynb")}
+    assert there == NOTEBOOKS.keys()
+
+
+@pytest.mark.slow  # the same functions run in the examples of pages
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_prints_what_its_text_says(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    path = ROOT / "examples" / "notebooks" / f"{name}.ipynb"
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    run(*code, __name__="__main__")
+    printed = capsys.readouterr().out
+    assert not [line for line in NOTEBOOKS[name] if not re.search(line, printed)]
 
 
 def test_a_program_trains_with_its_own_change(monkeypatch):

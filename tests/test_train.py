@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -15,10 +14,8 @@ from untrained import blank
 
 import jaxsense
 from jaxsense import train
-from jaxsense.config import PRESETS, Shape
-from jaxsense.run.rundir import RunDirectory, Settings
+from jaxsense.config import PRESETS
 from jaxsense.show import drawing
-from jaxsense.summary.blocks import cases
 from jaxsense.summary.read import read_summary
 
 
@@ -36,17 +33,8 @@ def test_run_directory_holds_everything(smoke_run):
 
 
 def test_summary_keeps_its_contract(smoke_run):
-    found = read_summary(smoke_run)  # which checks the type of each value
+    found = read_summary(smoke_run)  # its types; of most numbers, see `test_same_numbers`
     assert (found["preset"], found["seed"]) == ("smoke", 5)
-    assert set(found["detectors"]) == {"camera", "lidar"}
-    belief, latent = found["belief"], found["jmvae"]
-    assert belief["looks"] == [1, 2, 3, 4, 5, 6]
-    assert all(len(belief[curve]) == 6 for curve in ("nll", "accuracy", "bayes_nll"))
-    assert -1 <= belief["doubt_correlation"] <= 1
-    assert 0 <= latent["readout_error"] <= 0.01
-    for block in ("sigma_norm", "unambiguous", "consistent"):
-        assert set(latent[block]) == {"joint", "camera", "lidar"}
-        assert all(len(values) == 3 for values in latent[block].values())
     for block in found["dqn"].values():
         assert block["num_states"] == 384
         assert block["env_steps"] == 60 * 32  # epochs x environments of the smoke preset
@@ -57,16 +45,11 @@ def test_summary_keeps_its_contract(smoke_run):
         else:
             assert block["fraction_of_optimal"] == pytest.approx(block["return"] / block["optimal"])
             assert block["optimal_states"] < 384
-    assert set(found["mission"]) == {"latent", "naive", "random", "bytes_per_detection"}
-    for name, case in cases(found["mission"]).items():
+    assert set(found["mission"]) == {"latent", "naive", "random"}
+    for name, case in found["mission"].items():
         assert set(case) == MISSION_KEYS | ({"intervals"} if name != "latent" else set())
         assert case["episodes"] == sum(case["ended"].values()) == 4
         assert case["collisions"] == 0
-    # Two float32 for each of two dimensions, and one for each of two labels, against more than 1920
-    # bytes of pixels or beams.
-    told = found["mission"]["bytes_per_detection"]
-    assert (told["latent"], told["features"]) == (16, 8)
-    assert 1920 <= told["raw"] <= 2732
 
 
 def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
@@ -76,10 +59,12 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     monkeypatch.setattr(drawing.film, "draw", draw)
     monkeypatch.setattr(drawing.plots, "policies", lambda block: Figure())
     learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
-    for naive, films in ((None, ["mission.svg"]), ("other", ["mission.svg", "mission-naive.svg"])):
-        played = SimpleNamespace(recording="own", naive=naive)
+    own = {"naive_2": "own"}
+    films = ["mission.svg", "mission-naive.svg"]
+    for recordings in (own, {**own, "naive": "other"}):
+        played = SimpleNamespace(recordings=recordings)
         found = drawing.of_missions(config, learned, played, {})  # pyright: ignore
-        assert [*found] == ["policies.svg", *films]
+        assert [*found] == ["policies.svg", *films[: len(recordings)]]
     own = {"naive_2 policy": "own"}
     assert drawn == [own, {**own, "naive policy": "other"}]
 
@@ -116,47 +101,3 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     line = error_line([*SMOKE, "--out", str(smoke_run)], capsys)
     assert f"out = {str(smoke_run)!r}: is not empty; must be a new or empty directory" in line
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
-
-
-def test_all_help_explains_every_field(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit) as stop:
-        train.main(["--help-all"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    assert max(map(len, text.splitlines())) <= 80
-    options = re.findall(r"^  (--\S+)", text, re.MULTILINE)
-    assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
-    assert "(default: on; --mission.no-auctions turns it off)" in " ".join(text.split())
-    # Each option has a text.
-    assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
-
-
-def test_every_kind_of_option_is_read(tmp_path):
-    words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
-        --mission.no-auctions --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
-        --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
-        --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
-    arguments = train.parse(words.split())
-    config, smoke = arguments.settings.config, PRESETS["smoke"]
-    assert (arguments.settings.seed, arguments.cache, arguments.devices) == (4, None, None)
-    assert arguments.quiet is False
-    assert (config.arena.side, config.arena.num_pois) == (4.0, 4)
-    assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
-    assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
-    assert config.mdp.partly_seen_starts is True
-    assert config.mission == dataclasses.replace(smoke.mission, auctions=False)
-    assert config.team == dataclasses.replace(
-        smoke.team, travel=dataclasses.replace(smoke.team.travel, view_distance=0.3)
-    )
-    assert config.robots == ("camera", "camera", "lidar")
-    assert config.dqn == dataclasses.replace(smoke.dqn, hidden=(8,), observe="live")
-    # Of a stored run, of which other options change settings; then without an option's value.
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 7, config)):
-        file = str(tmp_path / "run" / "config.json")
-        again = train.parse(["--config", file, "--robots", "None", "--arena.side", "5"])
-        resumed = train.parse(["--resume", str(tmp_path / "run")])
-    given = again.settings
-    assert (given.seed, given.preset, given.config.robots) == (7, "smoke", None)
-    assert given.config.arena == dataclasses.replace(config.arena, side=5.0)
-    assert resumed.settings == Settings("smoke", 7, config)

@@ -152,7 +152,7 @@ def learner(task: Task, settings: Dqn) -> Learner:
 
 def _of_row(task: Task, settings: Dqn, steps: int) -> Any:
     """The algorithm with our network, learning rate, discount and number of environments."""
-    dqn, env = task.config.dqn, MapEnv(task.mdp, MODALITY)
+    dqn, env = task.config.dqn, MapEnv(task.mdp.of(MODALITY))
     same = dataclasses.replace(
         settings,
         discount=dqn.discount,

@@ -264,7 +264,9 @@ def _train(
 ) -> dict[int, Policy | Recurrent]:
     torch.set_num_threads(1)  # faster than two for networks of this size
     starts = prepared_starts(jax.random.key(2**30), task, NUM_STARTS)
-    envs = MapVecEnv(MapVectorEnv(task, None, learner.num_envs, starts, "SameStep"))
+    envs = MapVecEnv(
+        MapVectorEnv(task, num_envs=learner.num_envs, starts=starts, autoreset_mode="SameStep")
+    )
     found: dict[int, Policy | Recurrent] = {}
     for seed in seeds:
         model = learner.make(envs, seed)

@@ -8,8 +8,8 @@ from jaxsense.config.learning import DetectorConfig as DetectorConfig
 from jaxsense.config.learning import DqnConfig as DqnConfig
 from jaxsense.config.learning import JmvaeConfig as JmvaeConfig
 from jaxsense.config.learning import MdpConfig as MdpConfig
-from jaxsense.config.plain import as_plain as as_plain
-from jaxsense.config.plain import from_plain as from_plain
+from jaxsense.config.options import as_plain as as_plain
+from jaxsense.config.options import from_plain as from_plain
 from jaxsense.config.presets import PRESETS as PRESETS
 from jaxsense.config.scene import Attribute as Attribute
 from jaxsense.config.scene import CameraConfig as CameraConfig

@@ -1,27 +1,120 @@
-"""Settings as options of a command line: fields of dataclasses, described by the class."""
+"""Settings as plain data, the form of `config.json`, and as options of a command line."""
 
+import argparse
 import contextlib
 import dataclasses
+import difflib
+import functools
 import inspect
-import math
+import json
 import re
 import shlex
-import shutil
 import sys
-import textwrap
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, TypeVar, cast, get_args, get_origin, get_type_hints
 
-from jaxsense.config.plain import FORMER, made, nearest
+from jaxsense.config.section import ConfigError
+from jaxsense.config.whole import Config
 
 T = TypeVar("T")
-_LONGEST = 80  # characters of a word that an error repeats
+_LONGEST = 100  # characters of a reason, which may repeat a word
 
 
-class OptionError(ValueError):
-    """A command line that cannot be read; its text is one line."""
+def as_plain(config: Config) -> dict[str, Any]:
+    """Converts settings to dictionaries, lists, numbers and strings, for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_plain(stored: object, base: Config | None = None) -> Config:
+    """Makes settings from plain data, the inverse of `as_plain`.
+
+    Args:
+      stored: sections and their fields.
+      base: source of missing settings; the defaults by default.
+
+    Raises:
+      ConfigError: names a field that is unknown, of the wrong type, or invalid.
+    """
+    return cast(Config, _made(Config, stored, base or Config()))
+
+
+def _made(kind: Any, stored: object, base: object = None, place: str = "") -> object:
+    """A value of a type, its missing fields from `base`; dataclasses check their fields."""
+    if not dataclasses.is_dataclass(kind):
+        if isinstance(stored, dict) and len(inner := get_args(kind)) == 2:
+            return {n: _made(inner[1], each, None, f"{place}.{n}") for n, each in stored.items()}
+        return stored
+    if not isinstance(stored, dict):
+        raise ConfigError(place or "config", stored, "must be an object with names and values")
+    kinds, given = get_type_hints(kind), {}
+    for name, value in stored.items():
+        path = f"{place}.{name}".lstrip(".")
+        if name not in kinds:
+            near = _nearest(path, [*flat(as_plain(Config()))])
+            hint = f"; did you mean {' or '.join(near)}?" if near else ""
+            raise ConfigError(path, value, f"unknown setting{hint}")
+        default = getattr(kind if base is None else base, name, None)
+        given[name] = _made(kinds[name], value, default, path)
+    if base is not None:
+        return dataclasses.replace(cast(Any, base), **given)
+    for field in dataclasses.fields(kind):
+        if field.name not in given and field.default is dataclasses.MISSING:
+            raise ConfigError(place, stored, f"missing setting {field.name}")
+    return kind(**given)  # pyright: ignore[reportCallIssue]
+
+
+def without_former(stored: Mapping[str, Any], section: object | None = None) -> dict[str, Any]:
+    """Plain settings of models that travel with the package, without what are constants now."""
+    now, kept = vars(section or Config()), {}
+    for name, value in stored.items():
+        if dataclasses.is_dataclass(now.get(name)):
+            kept[name] = without_former(value, now[name])
+        elif name in now and isinstance(value, dict) == isinstance(now[name], dict):
+            kept[name] = value
+    return kept
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
+    """Plain settings by `section.name`."""
+    found: dict[str, object] = {}
+    for name, value in settings.items():
+        inner = flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else None
+        found |= {f"{prefix}{name}": value} if inner is None else inner
+    return found
+
+
+def _nearest(path: str, names: Sequence[str]) -> list[str]:
+    """The names nearest to an unknown one, of its section or else of any."""
+    section, _, last = path.rpartition(".")
+    apart = [name.rpartition(".") for name in names]
+    for known in ([name for name in apart if name[0] == section], apart):
+        for near in difflib.get_close_matches(last, [name[2] for name in known], 1, 0.7):
+            return ["".join(name) for name in known if name[2] == near]
+    return []
+
+
+def parse_json(content: bytes) -> object:
+    """Parses JSON strictly: UTF-8, no deep nesting, no field twice, no half of a character.
+
+    Raises:
+      ValueError: if the content is not such JSON.
+    """
+    try:
+        found = json.loads(content.decode(), object_pairs_hook=_without_twins)
+        json.dumps(found, ensure_ascii=False).encode()
+        return found
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
+    names = [name for name, _ in fields]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{name!r} appears twice")
+    return dict(fields)
 
 
 class Name(str):
@@ -36,14 +129,14 @@ class Option:
     """A command-line option, or the positional argument.
 
     Attributes:
-      path: fields and keys that lead to its value.
+      path: fields and keys that lead to its value, with dots between them.
       name: on the command line.
       kind: type of the value.
       default: value if it is missing; `dataclasses.MISSING` if it is required.
       section: dataclass that declares it.
     """
 
-    path: tuple[str, ...]
+    path: str
     name: str
     kind: object
     default: object
@@ -55,13 +148,13 @@ class Option:
         return types.NoneType in get_args(self.kind)
 
     @property
-    def words(self) -> tuple[object, float | None]:
-        """Type of the words of the value and, of a tuple, their number."""
+    def words(self) -> tuple[object, int | str | None]:
+        """Type of the words of the value and, of a tuple, their number as argparse has it."""
         kind = get_args(self.kind)[0] if self.is_optional else self.kind
         if get_origin(kind) is not tuple:
             return kind, None
         inner = get_args(kind)
-        return inner[0], math.inf if ... in inner else len(inner)
+        return inner[0], "*" if ... in inner else len(inner)
 
     @property
     def off(self) -> str:
@@ -70,21 +163,47 @@ class Option:
 
     @property
     def help(self) -> str:
-        """The field's description; of an entry of a dictionary, that of the dictionary."""
-        known = docs(self.section)
-        text = next((known[field] for field in reversed(self.path) if field in known), "")
-        return text.replace("`", "")
+        """The description of the field, or of the dictionary with this entry, and the default."""
+        known, value = docs(self.section), self.default
+        text = next((known[field] for field in self.path.split(".")[::-1] if field in known), "")
+        if value is True:
+            text += f" (default: on; {self.off} turns it off)"
+        elif value is not False and value not in (None, (), dataclasses.MISSING):
+            words = shlex.join(map(str, value)) if isinstance(value, tuple) else value
+            text += f" (default: {words})"
+        return text.replace("`", "").replace("%", "%%")
 
-    def value(self, words: list[str]) -> object:
-        """Reads the value. Words of another type stay text, which the dataclass refuses."""
+    def declare(self, parser: argparse._ActionsContainer) -> None:
+        """Adds it to a parser, whose result has its words or truth value under its path."""
         kind, number = self.words
+        how: dict[str, Any] = {"dest": self.path, "default": argparse.SUPPRESS}
+        if kind is bool:
+            parser.add_argument(self.name, action="store_true", help=self.help, **how)
+            off = {**how, "help": argparse.SUPPRESS}
+            parser.add_argument(self.off, action="store_false", **off)
+            return
+        if not self.name.startswith("-"):
+            number = number or "?"  # `read` names it if it is missing
+            how = {"default": argparse.SUPPRESS, "metavar": self.name, "nargs": number}
+            parser.add_argument(self.path, help=self.help, **how)
+            return
+        names: dict[object, str] = {int: "INT", float: "NUMBER", Path: "PATH"}
+        shown = f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else None
+        how |= {"metavar": shown or names.get(kind, "NAME"), "nargs": number}
+        parser.add_argument(self.name, help=self.help, **how)
+
+    def value(self, found: bool | str | list[str]) -> object:
+        """Reads what is given. Words of another type stay text, which the dataclass refuses."""
+        if isinstance(found, bool):
+            return found
+        words = found if isinstance(found, list) else [found]
         if self.is_optional and [word.lower() for word in words] == ["none"]:
             return None
-        values = tuple(_of_type(kind, word) for word in words)
-        return values[0] if number is None else values
+        values = tuple(_of_type(self.words[0], word) for word in words)
+        return values if isinstance(found, list) else values[0]
 
 
-def options_of(base: object, name: str = "--", path: tuple[str, ...] = ()) -> Iterator[Option]:
+def options_of(base: object, name: str = "--", path: str = "") -> Iterator[Option]:
     """All options of a dataclass, an instance or else the class, which holds their defaults."""
     section = base if isinstance(base, type) else type(base)
     kinds, marked = get_type_hints(section), get_type_hints(section, include_extras=True)
@@ -92,7 +211,7 @@ def options_of(base: object, name: str = "--", path: tuple[str, ...] = ()) -> It
     for field in (each.name for each in dataclasses.fields(cast(Any, section))):
         default = getattr(base, field, dataclasses.MISSING)
         own = next((mark for mark in get_args(marked[field]) if isinstance(mark, Name)), None)
-        inside, to = own or prefix + field.replace("_", "-"), (*path, field)
+        inside, to = own or prefix + field.replace("_", "-"), f"{path}.{field}".lstrip(".")
         if dataclasses.is_dataclass(default):
             yield from options_of(default, inside, to)
         elif isinstance(default, Mapping):
@@ -100,11 +219,31 @@ def options_of(base: object, name: str = "--", path: tuple[str, ...] = ()) -> It
             for key, each in default.items():
                 entry = f"{inside}.{key.replace('_', '-')}"
                 if dataclasses.is_dataclass(each):
-                    yield from options_of(each, entry, (*to, key))
+                    yield from options_of(each, entry, f"{to}.{key}")
                 else:
-                    yield Option((*to, key), entry, kind, each, section)
+                    yield Option(f"{to}.{key}", entry, kind, each, section)
         else:
             yield Option(to, inside, kinds[field], default, section)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser of some options, by section."""
+
+    def __init__(self, options: Iterable[Option], **texts: Any):
+        form = functools.partial(argparse.HelpFormatter, max_help_position=6)
+        super().__init__(add_help=False, allow_abbrev=False, formatter_class=form, **texts)
+        groups: dict[str, argparse._ArgumentGroup] = {}
+        for option in options:
+            place = getattr(option.section, "PLACE", "")
+            if place not in groups:
+                description = about(option.section).replace("`", "") if place else None
+                groups[place] = self.add_argument_group(place or "options", description)
+            option.declare(groups[place])
+
+    def error(self, message: str) -> NoReturn:
+        """Raises a `ConfigError` about "argument NAME: REASON"; argparse would end the process."""
+        name, _, reason = message.removeprefix("argument ").partition(": ")
+        raise ConfigError("option", name, reason[:_LONGEST])
 
 
 def read(base: T | type[T], argv: list[str]) -> T:
@@ -115,82 +254,36 @@ def read(base: T | type[T], argv: list[str]) -> T:
       argv: the command line without the program.
 
     Raises:
-      OptionError: if an option is unknown, or an option or a value is missing.
-      ConfigError: by the dataclass, for a value that is wrong.
+      ConfigError: if an option is unknown, an option or a value is missing, or a value is wrong.
     """
+    values, rest = given(base, argv)
     options = [*options_of(base)]
-    values, rest = _split(options, argv)
-    for option in options:
-        if not option.name.startswith("-") and rest and not _is_option(rest[0]):
-            number = 1 if option.words[1] is None else len(rest)
-            values[option.path], rest = option.value(rest[:number]), rest[number:]
-        elif option.default is dataclasses.MISSING and not rest:
-            what = option.help[:1].lower() + option.help[1:].rstrip(".")
-            raise OptionError(f"missing argument {option.name}: {what}")
     if rest:
-        raise OptionError(_unknown(rest, [option.name for option in options]))
+        raise ConfigError("option", *_unknown(rest, [option.name for option in options]))
+    for option in options:
+        if option.default is dataclasses.MISSING and option.path not in values:
+            raise ConfigError("option", option.name, f"is missing: {option.help}")
     kind = base if isinstance(base, type) else type(base)
     plain: dict[str, Any] = {} if isinstance(base, type) else dataclasses.asdict(cast(Any, base))
     for path, value in values.items():
-        plain = _changed(plain, path, value)
-    return cast(T, made(kind, plain))
+        plain = _changed(plain, path.split("."), value)
+    return cast(T, _made(kind, plain))
+
+
+def given(base: object, argv: list[str]) -> tuple[dict[str, object], list[str]]:
+    """The values on a command line by their paths, and the words that belong to no option."""
+    options = [*options_of(base)]
+    # Also `--num_seeds`.
+    dashed = [re.sub(r"^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in argv]
+    found, rest = _Parser(options).parse_known_args(dashed)
+    words = vars(found)
+    return {o.path: o.value(words[o.path]) for o in options if o.path in words}, rest
 
 
 def _changed(plain: Mapping[str, Any], path: Sequence[str], value: object) -> dict[str, Any]:
     """Nested dictionaries with another value at a path."""
     name, *rest = path
     return {**plain, name: _changed(plain.get(name, {}), rest, value) if rest else value}
-
-
-def read_some(arguments: type, argv: list[str], names: Sequence[str]) -> dict[str, object]:
-    """Reads some options of a dataclass before the defaults of the others are known.
-
-    Returns:
-      Values on the command line, by name; text where the type is wrong.
-
-    Raises:
-      OptionError: if the value of one of these options is missing.
-    """
-    options = {option.path: option for option in options_of(arguments) if option.name in names}
-    values, _ = _split([*options.values()], argv)
-    return {options[path].name: value for path, value in values.items()}
-
-
-def _split(
-    options: list[Option], argv: list[str]
-) -> tuple[dict[tuple[str, ...], object], list[str]]:
-    """The values on a command line by their paths, and the words that belong to no option."""
-    named = {option.name: option for option in options}
-    named |= {option.off: option for option in options if option.kind is bool}
-    values: dict[tuple[str, ...], object] = {}
-    rest: list[str] = []
-    words = [*argv]
-    while words:
-        word = words.pop(0)
-        name, equals, text = word.partition("=")
-        name = name.replace("_", "-") if name.startswith("--") else name  # also `--num_seeds`
-        option = named.get(name) if _is_option(name) else None
-        if option is None:
-            rest.append(word)
-        elif option.kind is bool:
-            if equals:
-                raise OptionError(f"argument {name}: ignored explicit argument '{_cut(text)}'")
-            values[option.path] = name != option.off
-        else:
-            most = option.words[1] or 1
-            given = [text] if equals else []
-            while words and not equals and len(given) < most and not _is_option(words[0]):
-                given.append(words.pop(0))
-            if most not in (len(given), math.inf):
-                expected = "one argument" if most == 1 else f"{most} arguments"
-                raise OptionError(f"argument {name}: expected {expected}")
-            values[option.path] = option.value(given)
-    return values, rest
-
-
-def _is_option(word: str) -> bool:
-    """Whether a word begins with a dash and is no negative number."""
-    return len(word) > 1 and word[0] == "-" and not re.fullmatch(r"-\d+|-\d*\.\d+", word)
 
 
 def _of_type(kind: object, word: str) -> object:
@@ -202,22 +295,14 @@ def _of_type(kind: object, word: str) -> object:
     return word
 
 
-def _cut(word: str) -> str:
-    word = word if word.isprintable() else repr(word)[1:-1]
-    return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..."
-
-
-def _unknown(words: list[str], names: list[str]) -> str:
-    """The message about words that belong to no option."""
+def _unknown(words: list[str], names: list[str]) -> tuple[str, str]:
+    """A word that belongs to no option, and what would be right."""
     word = next((word for word in words if word.startswith("-")), words[0])
-    name = word.partition("=")[0]
     if not word.startswith("-"):
-        return f"unexpected argument '{_cut(word)}': options start with --"
-    if re.sub(r"^--(no-)?", "", name).replace("-", "_") in FORMER:
-        return f"{_cut(name)} is no longer an option"
-    near = nearest(name[2:], [each[2:] for each in names if each.startswith("--")])
-    hint = f"did you mean --{near[0]}?" if near else "see --help-all"
-    return f"unknown option {_cut(name)}; {hint}"
+        return word, "unexpected argument: options start with --"
+    name = word.partition("=")[0]
+    near = _nearest(name[2:], [each[2:] for each in names if each.startswith("--")])
+    return name, f"is unknown; did you mean --{near[0]}?" if near else "is unknown; see --help-all"
 
 
 def command(program: str) -> str:
@@ -229,64 +314,22 @@ def command(program: str) -> str:
 
 
 def describe(program: str, base: object, common: Sequence[str] = ()) -> str:
-    """Returns the help, set for the width of the terminal.
+    """Returns the help.
 
     Args:
       program: module to run, for example "jaxsense.train".
       base: as in `read`.
       common: options to show, in this order; by default all, by section.
     """
-    width = max(shutil.get_terminal_size().columns - 2, 20)
     options = {option.name: option for option in options_of(base)}
-    usage = [f"usage: {command(program)} [OPTIONS]"]
-    usage += [_usage(each) for name, each in options.items() if not name.startswith("-")]
-    lines = [" ".join(usage), "", *_filled(about(base), width)]
-    place = None
-    for option in (options[name] for name in common or options):
-        inside = "" if common else getattr(option.section, "PLACE", "")
-        if inside != place:
-            lines += ["", f"{inside or 'options'}:"]
-            lines += [*_filled(about(option.section), width, 2), ""] if inside else []
-        place = inside
-        lines += [f"  {option.name} {_metavar(option)}".rstrip(), *_filled(_text(option), width, 6)]
-    if common:
-        lines += ["", f"--help-all lists all {len(options)} options."]
-    return "\n".join(lines)
-
-
-def _filled(text: str, width: int, indent: int = 0) -> list[str]:
-    """A text as indented lines, without backticks."""
-    lines = textwrap.wrap(text.replace("`", ""), width - indent, break_on_hyphens=False)
-    return [" " * indent + line for line in lines]
-
-
-def _usage(option: Option) -> str:
-    """A positional argument as a usage line shows it."""
-    several = f"{option.name} ..." if option.words[1] else option.name
-    return several if option.default is dataclasses.MISSING else f"[{several}]"
-
-
-def _metavar(option: Option) -> str:
-    """Placeholder in the help for the words of a value."""
-    kind, number = option.words
-    if kind is bool or not option.name.startswith("-"):
-        return ""
-    names: dict[object, str] = {int: "INT", float: "NUMBER", Path: "PATH"}
-    one = names.get(kind, "NAME")
-    if get_origin(kind) is Literal:
-        one = f"{{{','.join(get_args(kind))}}}"
-    return f"[{one} ...]" if number == math.inf else " ".join([one] * int(number or 1))
-
-
-def _text(option: Option) -> str:
-    """An option's description and default value."""
-    value = option.default
-    if value is True:
-        return f"{option.help} (default: on; {option.off} turns it off)"
-    if value in (None, (), dataclasses.MISSING) or value is False:
-        return option.help
-    words = shlex.join(map(str, value)) if isinstance(value, tuple) else value
-    return f"{option.help} (default: {words})"
+    named = (x for name, x in options.items() if not name.startswith("-"))
+    words = (f"[{x.name} ...]" if x.words[1] else x.name for x in named)
+    usage = " ".join([command(program), "[OPTIONS]", *words])
+    shown = (options[name] for name in common or options)
+    end = f"--help-all lists all {len(options)} options." if common else ""
+    return _Parser(
+        shown, usage=usage, description=about(base).replace("`", ""), epilog=end
+    ).format_help()
 
 
 def about(section: object) -> str:

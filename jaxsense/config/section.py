@@ -232,17 +232,17 @@ def _scalar(value: object, kind: type, limits: Limits, is_leaf: bool) -> object:
     raise TypeError
 
 
-_ONE_AND_MANY: dict[object, tuple[str, str]] = {
-    int: ("a whole number", "whole numbers"),
-    float: ("a number", "numbers"),
-    bool: ("True or False", "True or False"),
-    str: ("text", "texts"),
-    Path: ("a path of printable characters", "paths of printable characters"),
-    types.NoneType: ("None", "None"),
+_WORDS: dict[object, str] = {
+    int: "a whole number",
+    float: "a number",
+    bool: "True or False",
+    str: "text",
+    Path: "a path of printable characters",
+    types.NoneType: "None",
 }
 
 
-def described(kind: object, limits: Limits = _NO_LIMITS, *, many: bool = False) -> str:
+def described(kind: object, limits: Limits = _NO_LIMITS) -> str:
     """Description of a declared type and its limits, after "must be"."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Annotated:
@@ -256,14 +256,12 @@ def described(kind: object, limits: Limits = _NO_LIMITS, *, many: bool = False) 
         if limits.min_items:
             most = "or more" if limits.max_items is None else f"to {limits.max_items}"
             number = f"{limits.min_items} {most} "
-        each = described(inner[0], limits, many=True)
-        return f"{'lists' if many else 'a list'} of {number}{each}"
+        return f"a list of {number}values, each {described(inner[0], limits)}"
     if origin is Mapping:
-        return f"a dictionary from names to {described(inner[1], limits, many=True)}"
-    name = getattr(kind, "__name__", str(kind))
-    words = _ONE_AND_MANY.get(kind, (f"of type {name}", f"values of type {name}"))[many]
+        return f"a dictionary from names to values, each {described(inner[1], limits)}"
+    words = _WORDS.get(kind, f"of type {getattr(kind, '__name__', kind)}")
     range_ = str(limits) if kind in (int, float) else ""
-    return f"{words}, {'each ' if many else ''}{range_}" if range_ else words
+    return f"{words}, {range_}" if range_ else words
 
 
 @dataclass_transform(frozen_default=True)

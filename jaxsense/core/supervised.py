@@ -1,5 +1,7 @@
-"""The supervised fit of detectors, the JMVAE, the filter and tours: one `lax.scan`."""
+"""The supervised fit of detectors, the JMVAE and the filter: one `lax.scan`."""
 
+import dataclasses
+from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 import jax
@@ -27,21 +29,21 @@ class FitConfig(Protocol):
         ...
 
 
-class Problem(Protocol, Generic[D]):
-    """A loss to minimise, with its data."""
+@dataclasses.dataclass(frozen=True)
+class Problem(Generic[D]):
+    """A loss to minimise, with its data.
 
-    @property
-    def config(self) -> FitConfig:
-        """Settings of the fit."""
-        ...
+    Attributes:
+      config: settings of the fit.
+      draw: `(key, number) -> [number, ...]` random values of all steps, much cheaper together than
+        step by step.
+      loss: `(params, drawn, step) -> []` loss of one step of the whole fit, with a row of what
+        `draw` returns.
+    """
 
-    def draw(self, key: Key, number: int) -> D:
-        """`[number, ...]` random values of all steps, much cheaper together than step by step."""
-        ...
-
-    def loss(self, params: Params, drawn: D, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Loss of one step of the whole fit, with a row of what `draw` returns."""
-        ...
+    config: FitConfig
+    draw: Callable[[Key, int], D]
+    loss: Callable[[Params, D, Int[Array, ""]], Float[Array, ""]]
 
 
 @pytree

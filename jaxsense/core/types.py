@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar, dataclass_transform
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import serialization, struct
+from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 
 T = TypeVar("T")
@@ -44,17 +44,6 @@ def pytree(cls: type[T]) -> type[T]:
     fields = dataclasses.fields(made)
     leaves = [field.name for field in fields if field.metadata.get("pytree_node", True)]
     register(made, leaves, [field.name for field in fields if field.name not in leaves])
-
-    def to_state(tree: Any) -> dict[str, Any]:
-        return {name: serialization.to_state_dict(getattr(tree, name)) for name in leaves}
-
-    def from_state(tree: Any, state: dict[str, Any]) -> Any:
-        if state.keys() != set(leaves):
-            raise ValueError(f"fields of {cls.__name__}: {sorted(state)}; must be {leaves}")
-        found = [serialization.from_state_dict(getattr(tree, n), state[n], n) for n in leaves]
-        return dataclasses.replace(tree, **dict(zip(leaves, found, strict=True)))
-
-    serialization.register_serialization_state(made, to_state, from_state, override=True)
     made.replace = dataclasses.replace
     return made
 
@@ -83,6 +72,32 @@ def register(cls: type, leaves: Sequence[str], static: Sequence[str]) -> None:
         return tree
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+
+
+def by_place(tree: PyTree) -> dict[str, Any]:
+    """The leaves of a tree by their places in it, such as `detectors/0/threshold`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def placed(shapes: PyTree, arrays: Mapping[str, Any]) -> PyTree[np.ndarray]:
+    """A tree like `shapes`, from arrays by their places in it.
+
+    Raises:
+      ValueError: if one is missing or has another shape or dtype.
+    """
+
+    def leaf(place: str, expected: jax.ShapeDtypeStruct) -> np.ndarray:
+        if place not in arrays:
+            raise ValueError(f"{place} is missing")
+        found = np.asarray(arrays[place])
+        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
+            wanted = f"{expected.dtype}{expected.shape}"
+            raise ValueError(f"{place} is {found.dtype}{found.shape} in place of {wanted}")
+        return found
+
+    leaves = [leaf(*each) for each in by_place(shapes).items()]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
 @pytree

@@ -17,8 +17,7 @@ from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.mdp import Mdp, State
-from jaxsense.tasks.environment import Environment, Scaling, TimeStep
-from jaxsense.tasks.task import Task
+from jaxsense.tasks.task import Environment, Task, TimeStep
 
 T = TypeVar("T")
 
@@ -34,16 +33,9 @@ def extra(name: str) -> Iterator[None]:
         raise ModuleNotFoundError(message, name=package) from None
 
 
-def environment(mdp: Mdp | Environment, modality: int | None) -> Environment:
-    """A task as it is, or the MDP of one robot whose sensor has the index `modality`."""
-    if isinstance(mdp, Mdp):
-        if mdp.teams is not None:
-            raise ValueError("mdp is of teams: must be of one robot, with dqn.task = 'map'")
-        checks.require_index("modality", modality, mdp.num_modalities)
-        return Environment(mdp.of(modality))  # pyright: ignore[reportArgumentType]
-    if modality is not None:
-        raise ValueError(f"modality = {modality}: must be None with a task, which has its agent")
-    return mdp
+def environment(mdp: Mdp | Environment) -> Environment:
+    """A task as it is, or an MDP."""
+    return Environment(mdp) if isinstance(mdp, Mdp) else mdp
 
 
 def prepared_starts(key: Key, mdp: Mdp | Environment, number: int) -> PyTree:
@@ -54,9 +46,8 @@ def prepared_starts(key: Key, mdp: Mdp | Environment, number: int) -> PyTree:
     """
     checks.require_key(key)
     checks.require_number("number of starts", number)
-    played = Environment(mdp) if isinstance(mdp, Mdp) else mdp
     reset = jax.jit(jax.vmap(lambda key, played: played.reset(key)[1], (0, None)))
-    return reset(jax.random.split(key, number), played)
+    return reset(jax.random.split(key, number), environment(mdp))
 
 
 def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, " S"], PyTree]:
@@ -78,46 +69,20 @@ class Robots:
     its look and chooses next; each robot that works pays for the time that passed.
 
     Attributes:
-      mdp: the MDP, whose `robots` these are.
-      scaling: of observations; None for those of `dqn.team.surroundings`.
+      played: a task of the team, or its MDP.
       names: of the robots.
     """
 
-    mdp: Mdp
-    scaling: Scaling | None
+    played: Environment
     names: tuple[str, ...] = struct.field(pytree_node=False)
-
-    @property
-    def observation_size(self) -> int:
-        """S."""
-        return self.mdp.num_features * self.mdp.num_pois
-
-    @property
-    def num_actions(self) -> int:
-        """A look at each PoI, and NOP."""
-        return self.mdp.num_actions
-
-    @property
-    def bound(self) -> float:
-        """Observations are within plus and minus this."""
-        return float("inf") if self.scaling is None else self.scaling.bound
 
     def named(self, of_robots: Iterable[T]) -> dict[str, T]:
         """`[R, ...]` by the names of the robots."""
         return dict(zip(self.names, of_robots, strict=True))
 
-    def reset(self, key: Key) -> State:
-        """Starts an episode of all robots."""
-        return mdps.reset(key, self.mdp)
-
     def observe(self, state: State) -> Float[Array, "R S"]:
         """What each robot knows."""
-
-        def observation(robot: jax.Array) -> jax.Array:
-            features = self.mdp.features(state.belief, state.team, self.mdp.times(state), robot)
-            return features.T.reshape(-1) if self.scaling is None else self.scaling(features)
-
-        return jax.vmap(observation)(jnp.arange(len(self.names)))
+        return jax.vmap(self.played.seen_by, (0, None))(jnp.arange(len(self.names)), state)
 
     def action_mask(self, state: State) -> Bool[Array, "R A"]:
         """Actions of each robot: the PoIs that are present, if it is its turn, and NOP."""
@@ -135,11 +100,11 @@ class Robots:
           The state; for each robot its observation, its reward, whether it chose NOP, and whether
           it would go on at the limit; and the seconds that passed.
         """
-        checks.require_index("actions", actions, self.num_actions)
-        action = state.team.existing(actions[state.agent])
-        after, outcome = mdps.step(key, self.mdp, state, action)
+        mdp = self.played.mdp
+        checks.require_index("actions", actions, mdp.num_actions)
+        after, outcome = mdps.step(key, mdp, state, state.team.existing(actions[state.agent]))
         works, seconds = after.team.works, outcome.seconds
-        price = jnp.where(works, self.mdp.second_cost * seconds, 0.0)
+        price = jnp.where(works, mdp.second_cost * seconds, 0.0)
         earned = jnp.where(jnp.arange(len(self.names)) == after.agent, outcome.reward, 0.0)
         found = TimeStep(self.observe(after), earned - price, ~works, works & outcome.truncated)
         return after, found, seconds
@@ -147,22 +112,21 @@ class Robots:
 
 def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
     """Robots of a task; or of the MDP of teams, with the settings that name them."""
-    played = mdp.mdp if isinstance(mdp, Task) else mdp
-    teams = getattr(played, "teams", None)
-    if isinstance(mdp, Task) and teams and config is None:
-        carried = tuple(mdp.modalities[int(m)] for m in played.robots)
-        return Robots(played, mdp.scaling, names_of_robots(carried))
+    if isinstance(mdp, Task) and mdp.mdp.teams and config is None:
+        carried = tuple(mdp.modalities[int(m)] for m in mdp.mdp.robots)
+        return Robots(mdp, names_of_robots(carried))
+    teams = mdp.teams if isinstance(mdp, Mdp) else None
     if isinstance(mdp, Mdp) and teams and config and teams.modalities == config.modalities:
         robots = jnp.array(config.modality_of_robot, jnp.int32)
         whole = dataclasses.replace(teams, is_random=False)
-        played = dataclasses.replace(played, robots=robots, teams=whole)
-        return Robots(played, None, config.robot_names)
+        played = dataclasses.replace(mdp, robots=robots, teams=whole)
+        return Robots(Environment(played), config.robot_names)
     given = type(mdp).__name__ if isinstance(mdp, Mdp) else repr(mdp)
     task = "must be a task of a team alone, such as jaxsense.make('team-v0')"
     raise ValueError(f"mdp = {given}: {task}, or an Mdp of teams and the settings it is made with")
 
 
-def spaces_of(spaces: Any, played: Environment | Robots) -> tuple[Any, Any]:
+def spaces_of(spaces: Any, played: Environment) -> tuple[Any, Any]:
     """Another library's spaces of an observation, and of an action."""
     shape = (played.observation_size,)
     box = spaces.Box(-played.bound, played.bound, shape, np.float32)

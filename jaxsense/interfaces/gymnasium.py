@@ -38,7 +38,7 @@ class MapVectorEnv(VectorEnv):
     def __init__(
         self,
         mdp: Mdp | Environment,
-        modality: int | None = None,
+        *,
         num_envs: int = 1,
         starts: PyTree = None,
         # Quoted: where the site is built without Gymnasium, a stand-in has no `|`.
@@ -48,15 +48,15 @@ class MapVectorEnv(VectorEnv):
         """Makes the environments; `reset` must be called before the first step.
 
         Args:
-          mdp: a task from `jaxsense.make`, or the MDP of one agent, see `jaxsense.make_mdp`.
-          modality: index of the agent's own sensor; only with an MDP.
+          mdp: a task from `jaxsense.make`, or an MDP from `jaxsense.make_mdp`; `mdp.of(modality)`
+            gives its robot another sensor.
           num_envs: how many environments, E.
           starts: from `interfaces.prepared_starts`, to start each episode from a random one; by
             default each start is new, at the cost of several steps.
           autoreset_mode: when an ended episode restarts, as in `gymnasium.vector`.
           render_mode: `rgb_array`, so that `render` draws the maps; only with a task.
         """
-        self._played, self._starts = common.environment(mdp, modality), starts
+        self._played, self._starts = common.environment(mdp), starts
         checks.require_number("num_envs", num_envs)
         modes = ["rgb_array"] if isinstance(self._played, Task) else []
         if render_mode not in (None, *modes):
@@ -157,7 +157,8 @@ class TaskEnv(Env):
 
     def __init__(self, task: Task | str, agent: str | None = None, render_mode: str | None = None):
         """Makes the environment, see `make_vec`."""
-        self._envs = make_vec(task, 1, agent, None, AutoresetMode.DISABLED, render_mode)
+        options = {"autoreset_mode": AutoresetMode.DISABLED, "render_mode": render_mode}
+        self._envs = make_vec(task, 1, agent, **options)
         self.render_mode = render_mode
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space
@@ -192,8 +193,7 @@ def make_vec(
     num_envs: int,
     agent: str | None = None,
     starts: int | None = None,
-    autoreset_mode: "AutoresetMode | str" = AutoresetMode.NEXT_STEP,
-    render_mode: str | None = None,
+    **options: Any,
 ) -> MapVectorEnv:
     """Makes a vector environment: `gymnasium.make_vec("jaxsense/noisy-v0", num_envs=64)`.
 
@@ -202,12 +202,11 @@ def make_vec(
       num_envs: how many environments.
       agent: whose sensor looks, see `jaxsense.make`; only with a name.
       starts: number of prepared starts; by default each start is new, see `MapVectorEnv`.
-      autoreset_mode: see `MapVectorEnv`.
-      render_mode: see `MapVectorEnv`.
+      options: `autoreset_mode` and `render_mode` of `MapVectorEnv`.
     """
     found = as_task(task, agent)
     prepared = None if starts is None else common.prepared_starts(jax.random.key(0), found, starts)
-    return MapVectorEnv(found, None, num_envs, prepared, autoreset_mode, render_mode)
+    return MapVectorEnv(found, num_envs=num_envs, starts=prepared, **options)
 
 
 def _final(observations: np.ndarray, mask: np.ndarray, ended: np.ndarray) -> Infos:

@@ -56,14 +56,9 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
     the next episode. The methods are gymnax's.
     """
 
-    def __init__(self, mdp: Mdp | Environment, modality: int | None = None):
-        """Makes the environment.
-
-        Args:
-          mdp: a task from `jaxsense.make`, or the MDP of one agent, see `jaxsense.make_mdp`.
-          modality: index of the agent's own sensor; only with an MDP.
-        """
-        self.played = common.environment(mdp, modality)
+    def __init__(self, mdp: Mdp | Environment):
+        """Makes the environment of a task, or of an MDP; see `MapVectorEnv`."""
+        self.played = common.environment(mdp)
 
     @property
     def default_params(self) -> MapEnvParams:

@@ -59,14 +59,16 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         self.robots = common.robots_of(mdp, config)
         super().__init__(len(self.robots.names))
         self.agents = list(self.robots.names)
-        of_each = (dict.fromkeys(self.agents, x) for x in common.spaces_of(spaces, self.robots))
+        of_each = (
+            dict.fromkeys(self.agents, x) for x in common.spaces_of(spaces, self.robots.played)
+        )
         self.observation_spaces, self.action_spaces = of_each
 
     # jaxmarl makes the environment static, here as in its `step`, and with it the MDP.
     @functools.partial(jax.jit, static_argnums=0)
     def reset(self, key: Key) -> tuple[OfRobots, TeamEnvState]:
         """Starts an episode."""
-        start = self.robots.reset(key)
+        _, start = self.robots.played.reset(key)
         state = TeamEnvState(done=jnp.bool_(False), step=start.steps, team=start)  # pyright: ignore
         return self.get_obs(state), state
 
@@ -98,7 +100,7 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
     @property
     def agent_classes(self) -> dict[str, list[str]]:
         """Robots of each modality."""
-        mdp, classes = self.robots.mdp, dict[str, list[str]]()
+        mdp, classes = self.robots.played.mdp, dict[str, list[str]]()
         for agent, sensor in zip(self.agents, mdp.robots, strict=True):
             classes.setdefault(mdp.modalities[int(sensor)], []).append(agent)
         return classes

@@ -47,7 +47,7 @@ class TeamAECEnv(AECEnv):
         self.render_mode = None
         self.possible_agents = list(self._robots.names)
         self.agents = []
-        of_each = common.spaces_of(spaces, self._robots)
+        of_each = common.spaces_of(spaces, self._robots.played)
         self._spaces = dict.fromkeys(self.possible_agents, of_each)
         self._key: Key | None = None
 
@@ -155,7 +155,7 @@ def make_parallel(name: str) -> TeamParallelEnv:
 def _start(key: Key, robots: Robots) -> tuple[Key, State, jax.Array, jax.Array]:
     """Next key, state, `[R, S]` observations and `[R, N + 1]` actions that robots have."""
     next_key, key = jax.random.split(key)
-    state = robots.reset(key)
+    _, state = robots.played.reset(key)
     return next_key, state, robots.observe(state), robots.action_mask(state)
 
 

@@ -18,7 +18,7 @@ Infos = list[dict[str, bool | np.ndarray]]
 class MapVecEnv(VecEnv):
     """Adapts a vector environment of Gymnasium to Stable-Baselines3.
 
-    `MapVecEnv(MapVectorEnv(mdp, modality, num_envs, autoreset_mode="SameStep"))`. The methods are
+    `MapVecEnv(MapVectorEnv(mdp, num_envs=64, autoreset_mode="SameStep"))`. The methods are
     Stable-Baselines3's. The environments are one program: attributes and methods apply to all,
     whatever the indices; only `action_masks`, for sb3-contrib, has a row for each.
     """

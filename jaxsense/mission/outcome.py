@@ -35,7 +35,7 @@ to even when it retried; `undetected`: it gave one up after looks that showed no
 
 FAULT_TIME = 6.0  # s
 _FAULTS = ("alone", "stops", "blind")
-_TAKEN = ("all", "policies", "bytes_per_detection")  # by `evaluate` and by the summary
+_TAKEN = ("all", "policies")  # by `evaluate`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,6 +160,5 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
         "goals": jnp.sum(robots.goals),
         "goals_reached": jnp.sum(robots.reached),
         "information": jnp.sum(rewards.information(state.belief.std)),
-        "detections": robots.detections,
         "reason": reason(state),
     }

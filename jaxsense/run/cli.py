@@ -20,30 +20,23 @@ CACHE = (_CACHES if _CACHES.is_absolute() else Path("~/.cache")) / "jaxsense"
 """Where compiled programs are kept for later calls."""
 
 
-def parse(
-    program: str,
-    arguments: type[T],
-    argv: list[str],
-    default: T | None = None,
-    common: Sequence[str] = (),
-) -> T:
+def parse(program: str, base: T | type[T], argv: list[str] | None, common: Sequence[str] = ()) -> T:
     """Reads a command line; ends the program after printing the help or an error.
 
     Args:
       program: module to run, for example "jaxsense.train".
-      arguments: dataclass of the options, which checks their values.
-      argv: the command line without the program.
-      default: values of missing options; those of the class by default.
+      base: dataclass of the options; an instance, or else the class, holds their defaults.
+      argv: the command line without the program; by default the process's own.
       common: options that `--help` shows, in this order; all by default.
     """
-    base = arguments if default is None else default
+    argv = sys.argv[1:] if argv is None else argv
     if {"-h", "--help", "--help-all"} & set(argv):
-        tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip("\n"))
+        tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip())
         sys.exit(0)
     try:
         require_32_bits()
         return options.read(base, argv)
-    except (ConfigError, options.OptionError) as error:
+    except ConfigError as error:
         fail(program, str(error))
 
 
@@ -63,16 +56,6 @@ def reason(error: OSError) -> str:
     return f"{error.filename}: {error.strerror}" if error.filename else str(error)
 
 
-def require_directory(field: str, path: Path | None) -> None:
-    """Raises a `ConfigError` unless a path is None, a directory, or may become one."""
-    try:
-        is_other = path is not None and path.exists() and not path.is_dir()
-    except OSError as error:
-        raise ConfigError(field, str(path), f"cannot be used ({error.strerror})") from None
-    if is_other:
-        raise ConfigError(field, str(path), "must be a directory")
-
-
 def keep_programs(
     program: str, directory: Path | None, config: Config, *, has_own_code: bool = False
 ) -> Kept | None:
@@ -80,17 +63,22 @@ def keep_programs(
 
     Returns:
       The programs with these settings; None with custom sensors or policies, whose code may
-      change, and, with a warning, if the directory cannot be used.
+      change, and, with a warning, if the usual directory cannot be used.
+
+    Raises:
+      ConfigError: if another directory cannot be used.
     """
     # All processes of a run must load a program together.
     if directory is None or jax.process_count() > 1:
         return None
     try:
-        directory = directory.expanduser()
-        use_cache(directory)
-        if config.named_code or has_own_code:
-            return None
-        return Kept(directory, jax.tree.structure(config))
+        place = directory.expanduser()
+        use_cache(place)
+        is_kept = not (config.named_code or has_own_code)
+        return Kept(place, jax.tree.structure(config)) if is_kept else None
     except (OSError, RuntimeError) as error:
-        warn(program, f"programs cannot be kept in {directory} ({error})")
+        reason = getattr(error, "strerror", None) or error
+        if directory != CACHE:
+            raise ConfigError("cache", str(directory), f"must be a directory ({reason})") from None
+        warn(program, f"programs cannot be kept in {directory} ({reason})")
         return None

@@ -274,7 +274,7 @@ class Program:
 
     def measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
         """Adds the seconds of a block to those of the stage."""
-        return self._monitor.stopwatch.measure(kind, self._stage)
+        return self._monitor.measure(kind, self._stage)
 
     def fail(self, error: BaseException) -> None:
         """Makes all calls raise an error, unless the program is compiled already."""

@@ -1,4 +1,4 @@
-"""Spreads work over the cores of a CPU and over accelerators."""
+"""Spreads work over the cores of a CPU, over accelerators, and over processes that share a run."""
 
 import contextlib
 import ctypes
@@ -6,8 +6,10 @@ import dataclasses
 import functools
 import math
 import os
+import socket
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from typing import Any, TypeAlias, TypeVar
 
 import jax
@@ -18,14 +20,15 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
-from jaxsense.run import processes
-from jaxsense.run.output import cores
+from jaxsense.run.output import cores, say
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 Options: TypeAlias = dict[str, Any]  # JAX declares fewer types than it takes
 AXIS = "devices"
+_JOIN_TIMEOUT = 300.0  # s
+LEAVE_TIMEOUT = 10.0  # s
 _LEAST_MEMORY = 2**33  # bytes, of an accelerator
 _ALIGNED = 64  # bytes
 _PASSES_OVER_LOOPS = "while-loop-invariant-code-motion,while-loop-constant-sinking"
@@ -122,7 +125,7 @@ def start(number: int | None) -> Workers:
     number = number or there
     if not least <= number <= there:
         # All processes refuse; one that ends without the others makes them abort.
-        processes.leave(processes.LEAVE_TIMEOUT)
+        leave(LEAVE_TIMEOUT)
         raise ConfigError("devices", number, f"must be from {least} to {there}")
     return Workers(mesh=make_mesh(number) if number > 1 else None)
 
@@ -179,11 +182,6 @@ def put(values: PyTree, place: NamedSharding) -> PyTree[jax.Array]:
         return jax.make_array_from_callback(local.shape, place, lambda index: local[index])
 
     return jax.tree.map(put_one, values)
-
-
-def put_everywhere(values: PyTree, mesh: Mesh | None) -> PyTree[jax.Array]:
-    """Puts values, the same in every process, on every device of a mesh, or on the one device."""
-    return jax.device_put(values) if mesh is None else put(values, places(mesh, 1, whole=1)[0])
 
 
 def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
@@ -264,3 +262,85 @@ def give_back_freed() -> None:
     # Other systems have no such function, or need none.
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def join(
+    coordinator: str | None, number: int | None, index: int | None, *, quiet: bool = False
+) -> None:
+    """Joins the processes that share a run; does nothing without arguments.
+
+    Ctrl-C ends the wait for the other processes.
+
+    Args:
+      coordinator: `HOST:PORT` of the first process, which listens at this address only.
+      number: of processes.
+      index: of this process, from 0.
+      quiet: whether not to say that it waits.
+
+    Raises:
+      ConfigError: if only some arguments are given, if a value is wrong, or if the others do not
+        come within five minutes.
+    """
+    given = {"coordinator": coordinator, "num_processes": number, "process_index": index}
+    if coordinator is None or number is None or index is None:
+        missing = [f"--{name.replace('_', '-')}" for name, x in given.items() if x is None]
+        for name in (name for name, x in given.items() if x is not None):
+            raise ConfigError(name, given[name], f"also needs {' and '.join(missing)}")
+        return
+    host, _, port = coordinator.rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
+        reason = "must be HOST:PORT, with a port from 1 to 65535"
+        raise ConfigError("coordinator", coordinator, reason)
+    if number < 1:
+        raise ConfigError("num_processes", number, "must be greater than 0")
+    if not 0 <= index < number:
+        raise ConfigError("process_index", index, f"must be from 0 to {number - 1}")
+    try:
+        socket.getaddrinfo(host.strip("[]"), port)
+    except OSError as error:
+        raise ConfigError("coordinator", coordinator, f"cannot be found ({error})") from None
+    if not quiet:
+        say(f"Waiting for the other processes at {coordinator}.")
+    joined: Future[None] = Future()
+
+    def initialise() -> None:
+        try:
+            jax.distributed.initialize(
+                coordinator,
+                number,
+                index,
+                coordinator_bind_address=coordinator if index == 0 else None,
+                # JAX ends the process when this is over, so it must come second.
+                initialization_timeout=int(2 * _JOIN_TIMEOUT),
+            )
+            joined.set_result(None)
+        except BaseException as error:
+            joined.set_exception(error)
+
+    # A signal is not noticed in the thread that waits within JAX.
+    threading.Thread(target=initialise, daemon=True).start()
+    try:
+        joined.result(_JOIN_TIMEOUT)
+    except TimeoutError:
+        reason = f"not all {number} processes have joined within {_JOIN_TIMEOUT:.0f} s"
+        raise ConfigError("coordinator", coordinator, reason) from None
+    except (RuntimeError, ValueError) as error:
+        reason = f"cannot be joined ({str(error).splitlines()[0]})"
+        raise ConfigError("coordinator", coordinator, reason) from None
+
+
+def of_first_process(values: np.ndarray) -> np.ndarray:
+    """The first process's values, in all processes; blocks until all have called it."""
+    return np.asarray(multihost_utils.broadcast_one_to_all(values))
+
+
+def leave(timeout: float | None = None) -> None:
+    """Waits for the other processes of the run, if any, and disconnects.
+
+    Args:
+      timeout: seconds to wait for processes that may not end; by default without limit.
+    """
+    if jax.process_count() > 1:
+        waiting = threading.Thread(target=jax.distributed.shutdown, daemon=True)
+        waiting.start()
+        waiting.join(timeout)

@@ -7,10 +7,9 @@ import os
 import re
 import secrets
 import sys
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import filelock
 import jax
@@ -20,6 +19,7 @@ from jaxtyping import PyTree
 
 from jaxsense.config import ConfigError
 from jaxsense.core import inside
+from jaxsense.core.types import by_place, placed
 from jaxsense.run.monitor import is_finite
 
 T = TypeVar("T")
@@ -157,28 +157,23 @@ class Checkpoints:
         self,
         path: Path,
         warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
-        saved: Callable[[str], object] = lambda name: None,
     ):
         """Opens a directory, which need not exist.
 
         Args:
           path: the directory.
           warn: receives a line about each damaged checkpoint.
-          saved: receives the name of each checkpoint once it is saved.
         """
-        self.path, self._warn, self._saved = path, warn, saved
-        self._lock = threading.Lock()
+        self.path, self._warn = path, warn
 
     def save(self, name: str, tree: PyTree) -> None:
         """Saves a pytree of arrays; raises `OSError` if the file cannot be written."""
         file, tree = self._file(name), jax.tree.map(np.asarray, tree)
         file.parent.mkdir(parents=True, exist_ok=True)
-        content = serialization.msgpack_serialize(serialization.to_state_dict(tree))
+        content = serialization.msgpack_serialize(by_place(tree))
         write_digested(file, content)
-        with self._lock:
-            self._saved(name)
 
-    def load(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
+    def load(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree:
         """Loads a checkpoint.
 
         Args:
@@ -187,17 +182,23 @@ class Checkpoints:
           finite: whether all numbers must be finite.
 
         Returns:
-          The tree, with arrays on the host; None if it was not saved.
+          The tree, with arrays on the host.
 
         Raises:
-          ConfigError: if the file is damaged or holds arrays of other shapes.
+          ConfigError: if the file is missing, damaged or holds arrays of other shapes.
         """
         most = _REST + 8 * sum(x.size for x in jax.tree.leaves(shapes))
         try:
             content = without_digest(inside.read(self._file(name), most))
-            return _like(shapes, serialization.msgpack_restore(content), finite)
+            found: Any = serialization.msgpack_restore(content)
+            if found.keys() != by_place(shapes).keys():
+                raise ValueError("it holds other arrays")
+            tree = placed(shapes, found)
+            if finite and not is_finite(tree):
+                raise ValueError("it holds numbers that are not finite")
+            return tree
         except FileNotFoundError:
-            return None
+            reason = "is missing; must be that of a finished run"
         except OSError as error:
             reason = f"cannot be read ({error.strerror})"
         except Exception as error:  # the digest may be right and the content of any form
@@ -206,11 +207,12 @@ class Checkpoints:
         raise ConfigError("checkpoint", f"{self.path}/{name}{_SUFFIX}", reason)
 
     def load_or_forget(self, name: str, shapes: PyTree[T], finite: bool = False) -> PyTree | None:
-        """As `load`, but warns and sets the file aside if it cannot be used, and returns None."""
+        """As `load`; None if there is no file, or, with a warning, if it must be set aside."""
+        if not os.path.lexists(file := self._file(name)):
+            return None
         try:
             return self.load(name, shapes, finite)
         except ConfigError as error:
-            file = self._file(name)
             file.replace(file.with_name(f"{file.name}.damaged"))
             self._warn(f"{error}; retraining it")
             return None
@@ -226,20 +228,3 @@ class Checkpoints:
         """The file of a checkpoint, which may be a link; raises `OSError` if it is elsewhere."""
         file = self.path / f"{name}{_SUFFIX}"
         return inside.place(file.parent, self.path.parent) / file.name
-
-
-def _like(shapes: PyTree[T], found: PyTree, finite: bool = False) -> PyTree[np.ndarray]:
-    """A tree like `shapes` from nested dictionaries; raises `ValueError` if they differ."""
-
-    def check(expected: jax.ShapeDtypeStruct, found: np.ndarray) -> np.ndarray:
-        found = np.asarray(found)
-        if (found.shape, found.dtype) != (expected.shape, expected.dtype):
-            wanted = f"{expected.dtype}{expected.shape}"
-            raise ValueError(f"{found.dtype}{found.shape} in place of {wanted}")
-        return found
-
-    if jax.tree.structure(serialization.to_state_dict(shapes)) != jax.tree.structure(found):
-        raise ValueError("it holds other arrays")
-    if finite and not is_finite(found):
-        raise ValueError("it holds numbers that are not finite")
-    return jax.tree.map(check, shapes, serialization.from_state_dict(shapes, found))

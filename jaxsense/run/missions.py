@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
+import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import jax
@@ -12,16 +13,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
 from jaxsense.config import Config
+from jaxsense.config.mission import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES
 from jaxsense.core.types import Key, pytree
 from jaxsense.mission import Case, Mission, MissionState, Record, make_mission, reset
+from jaxsense.mission.maps import MOST_LOOKS
 from jaxsense.mission.outcome import measure
+from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.models import Models, init
 from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.ledger import CHUNK, Ledger, batch_of, runs_long
 from jaxsense.run.monitor import StageError
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
@@ -29,6 +32,42 @@ Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 _STAGE = "mission"  # name of the programs in profiles and caches
 _SECOND = "naive"  # whose first mission is recorded as well as that of the first case
 _RECORDED = 2  # missions at a time on each device, in its first slots
+CHUNK = math.ceil(2.5 / CONTROL_PERIOD)
+"""Control periods between two reports."""
+# Missions side by side on each thread of a CPU or on each accelerator.
+_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
+_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
+# A control step of so many missions takes an accelerator twice as long as that of a few. With T
+# missions, B of which play at once, the time is about (T / B + 1) * (1 + B / this): B squared is
+# this times T at its minimum.
+_AS_LONG_AS_NONE = 8192
+_MANY_POIS = 2**14  # of all missions that take longer to play than faster programs to compile
+
+
+def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
+    """Number of missions side by side, below `total` since some missions last long.
+
+    A CPU holds them in its caches, an accelerator in a small part of its memory, and more the more
+    there are.
+    """
+    memory = devices.memory()
+    if memory is None:
+        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
+        return min(most * workers.number, -(-total // 3))
+    share = max(1, int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config))
+    pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
+    return min(total, pays, min(_MOST_OF_ACCELERATOR, share) * workers.number)
+
+
+def _bytes_of_state(config: Config) -> int:
+    """Approximate size of a mission's state: its roadmap, its robots' maps and some more."""
+    robots, num_classes = len(config.carried), len(config.arena.classes)
+    views = config.arena.num_pois * VIEW_SIDES * len(VIEW_DISTANCES)
+    nodes = config.arena.num_pois * NODES_PER_POI
+    numbers = nodes * (nodes + robots)
+    if config.mission.communication.own_maps:
+        numbers += robots * MOST_LOOKS * (robots + 2 * num_classes)
+    return 2**13 + 4 * numbers + nodes * views
 
 
 @pytree
@@ -50,16 +89,14 @@ class Played:
 
     Attributes:
       metrics: `[episodes, ...]` metrics of each case; see `mission.outcome.measure`.
-      recording: the first mission of the first case.
+      recordings: the first mission of the first case and, if there was a slot for it, the same
+        one under naive exploration.
       control_steps: total number of control periods, until each mission's end.
-      naive: the same mission under naive exploration; None if it was not played, or if there was
-        no slot beside the first one.
     """
 
     metrics: dict[str, Measured]
-    recording: Recording
+    recordings: dict[str, Recording]
     control_steps: int
-    naive: Recording | None = None
 
 
 def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
@@ -79,16 +116,7 @@ class _Slots:
 
 @pytree
 class _Found:
-    """What the host reads of B missions after a chunk.
-
-    Attributes:
-      done: whether they are over.
-      steps: control periods so far.
-      chunks: played so far.
-      is_finite: whether their beliefs are finite.
-      has_values: whether no policy returned NaN.
-      metrics: see `mission.outcome.measure`.
-    """
+    """What the host reads of B missions after a chunk; policies have values unless one is NaN."""
 
     done: Bool[Array, " B"]
     steps: Int[Array, " B"]
@@ -96,6 +124,64 @@ class _Found:
     is_finite: Bool[Array, " B"]
     has_values: Bool[Array, " B"]
     metrics: PyTree[Array]
+
+
+class Ledger:
+    """Assigns missions to the P x S slots of a batch, whose P parts lie on devices of their own.
+
+    A mission that is done makes room for the next one of its part, from a reserve of P x S missions
+    that have begun.
+    """
+
+    def __init__(self, waiting: Sequence[Int[np.ndarray, " _"]], slots: int):
+        """Lets the missions of each of the P parts wait for its S slots."""
+        self._waiting = [missions.tolist() for missions in waiting]
+        self._playing = np.full((len(waiting), slots), -1, np.int32)  # idle slots
+        self._reserve = self._playing.copy()  # missions that are still there
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all missions are done."""
+        return not any(self._waiting) and max(self._playing.max(), self._reserve.max()) < 0
+
+    @property
+    def needs_reserve(self) -> bool:
+        """Whether missions wait in a part whose reserve is used up."""
+        parts = zip(self._waiting, self._reserve, strict=True)
+        return any(bool(waiting) and reserve.max() < 0 for waiting, reserve in parts)
+
+    def reserve(self) -> Int[np.ndarray, " B"]:
+        """Begins a new reserve: `[P * S]` missions. Where a part has fewer, one fills the rest."""
+        for waiting, reserve in zip(self._waiting, self._reserve, strict=True):
+            first = [*reserve[reserve >= 0].tolist(), *waiting]
+            some, waiting[:] = first[: len(reserve)], first[len(reserve) :]
+            reserve[:] = some + [-1] * (len(reserve) - len(some))
+        return np.maximum(self._reserve, 0).reshape(-1)
+
+    def fill(self) -> Int[np.ndarray, " B"]:
+        """Gives idle slots to missions of the reserve.
+
+        Returns:
+          `[P * S]` index that each slot takes of the reserve of its part; -1 if it keeps its own.
+        """
+        taken = np.full_like(self._playing, -1)
+        for part, (playing, reserve) in enumerate(zip(self._playing, self._reserve, strict=True)):
+            idle, ready = np.flatnonzero(playing < 0), np.flatnonzero(reserve >= 0)
+            number = min(len(idle), len(ready))
+            idle, ready = idle[:number], ready[:number]
+            taken[part, idle], playing[idle], reserve[ready] = ready, reserve[ready], -1
+        return taken.reshape(-1)
+
+    @property
+    def playing(self) -> Int[np.ndarray, " B"]:
+        """`[P * S]` mission in each slot; -1 in idle ones."""
+        return self._playing.reshape(-1)
+
+    def end(self, done: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:
+        """Ends missions in slots that are `done`; returns the slots that are idle from now on."""
+        slots = np.flatnonzero(done & (self.playing >= 0))
+        self.playing[slots] = -1
+        return slots
 
 
 class Player:
@@ -119,8 +205,6 @@ class Player:
         """Starts to compile the programs.
 
         Args:
-          mission: to play.
-          compiler: compiles in the background.
           total: number of missions to play, from which the size of a batch follows.
           workers: share the missions. Each thread plays its own, without waiting for the others.
           models: with the shapes of those to play with, for example with a custom fusion; by
@@ -133,7 +217,7 @@ class Player:
         self._recorded = min(_RECORDED, self._share)
         self.batch = self._share * workers.number
         # Devices of a mesh take each call together; threads take their own.
-        rows, long = self.batch // workers.threads, runs_long(config, total)
+        rows, long = self.batch // workers.threads, total * config.arena.num_pois >= _MANY_POIS
         numbers = jax.ShapeDtypeStruct((rows,), jnp.int32)
         faults = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), no_faults(config)
@@ -155,13 +239,7 @@ class Player:
         self._go_on.wait()
 
     def play(self, key: Key, models: Models, played: dict[str, Case], episodes: int) -> Played:
-        """Plays every case in the same arenas.
-
-        Args:
-          key: random key.
-          models: trained networks.
-          played: the cases.
-          episodes: missions of each case.
+        """Plays `episodes` missions of every case, in the same arenas.
 
         Raises:
           StageError: if the models or the beliefs of a mission are not finite, which policies would
@@ -178,8 +256,9 @@ class Player:
         ]
         missions = episode, *jax.tree.map(lambda *x: np.stack(x)[case], *of_cases)
         # Missions to record begin in the first slots of the first worker.
-        second = [*played].index(_SECOND) if _SECOND in played else 0
-        recorded = np.unique([0, second * episodes])[: self._recorded]
+        names = [*played]
+        shown = [name for name in names if name in (names[0], _SECOND)][: self._recorded]
+        recorded = np.array([names.index(name) * episodes for name in shown])
         others = np.setdiff1d(np.arange(total), recorded)
         queues = [others[i::number] for i in range(number)]
         queues[0] = np.append(recorded, queues[0])
@@ -190,9 +269,13 @@ class Player:
                 done[0] += some
                 self._monitor.progress(_STAGE, done[0], total)
 
-        with self._monitor.stopwatch.measure("run_s", _STAGE):
+        with self._monitor.measure("run_s", _STAGE):
             # Loaded models lie on the host, and every chunk would transfer them again.
-            given = key, config, devices.put_everywhere(models, self._workers.mesh)
+            if (mesh := self._workers.mesh) is None:
+                models = jax.device_put(models)
+            else:
+                models = devices.put(models, devices.places(mesh, 1, whole=1)[0])
+            given = key, config, models
             play = functools.partial(self._play, given, missions, recorded, end)
             lanes = [queues[i::threads] for i in range(threads)]
             results = devices.side_by_side(play, lanes, threads, fail=self._monitor.fail)
@@ -203,8 +286,8 @@ class Player:
             name: _rows(found.metrics, slice(i * episodes, (i + 1) * episodes))
             for i, name in enumerate(played)
         }
-        recording, *naive = results[0][1]
-        return Played(metrics, recording, int(found.steps.sum()), *naive)
+        recordings = dict(zip(shown, results[0][1], strict=True))
+        return Played(metrics, recordings, int(found.steps.sum()))
 
     def _play(
         self,
@@ -214,14 +297,13 @@ class Player:
         end: Callable[[int], None],
         queues: list[Int[np.ndarray, " _"]],
     ) -> tuple[list[tuple[np.ndarray, _Found]], list[Recording]]:
-        """Plays the missions in the queues of one of the threads.
+        """Plays the missions in the queues of a thread, one for each of its devices.
 
         Args:
           given: what all calls of the programs take first.
           missions: `[E]` episode, policy and faults of each.
           recorded: missions to record, the first ones of the first queue.
           end: receives the number of missions that have ended.
-          queues: of each device of the thread.
 
         Returns:
           Missions that have ended at the same time with what was found of them, and recordings.

@@ -34,16 +34,32 @@ def is_finite(values: PyTree) -> bool:
     return all(np.isfinite(x).all() for x in jax.tree.leaves(values) if is_float(x))
 
 
-class Stopwatch:
-    """Measures the seconds of a run, and of each of its stages in all threads."""
+class Monitor:
+    """The stopwatch and the listener that the stages of a run share, in all threads."""
 
-    def __init__(self):
-        """Starts now."""
-        self._lock = threading.Lock()
+    def __init__(
+        self,
+        listener: Listener = lambda stage, done, total, metrics: None,
+        warn: Callable[[str], None] = lambda text: None,
+    ):
+        """Begins a run.
+
+        Args:
+          listener: receives progress.
+          warn: receives a line about a failure that does not end the run.
+        """
+        self.warn = warn
+        self._lock, self._stop = threading.Lock(), threading.Event()
+        self.begin(listener)
         self.restart()
 
+    def begin(self, listener: Listener) -> None:
+        """Begins another run: forgets a failure and replaces the listener."""
+        self._failure: BaseException | None = None
+        self._listener = listener
+
     def restart(self) -> None:
-        """Starts again for another run."""
+        """Starts the stopwatch again for another run."""
         self._begin, self._stages = time.perf_counter(), dict[str, StageTiming]()
 
     @contextlib.contextmanager
@@ -60,30 +76,6 @@ class Stopwatch:
         with self._lock:
             stages = {name: each.copy() for name, each in self._stages.items()}
         return {"total_s": time.perf_counter() - self._begin, "stages": stages}
-
-
-class Monitor:
-    """The stopwatch and the listener that the stages of a run share."""
-
-    def __init__(
-        self,
-        listener: Listener = lambda stage, done, total, metrics: None,
-        warn: Callable[[str], None] = lambda text: None,
-    ):
-        """Begins a run.
-
-        Args:
-          listener: receives progress.
-          warn: receives a line about a failure that does not end the run.
-        """
-        self._lock, self._stop = threading.Lock(), threading.Event()
-        self.warn, self.stopwatch = warn, Stopwatch()
-        self.begin(listener)
-
-    def begin(self, listener: Listener) -> None:
-        """Begins another run: forgets a failure and replaces the listener."""
-        self._failure: BaseException | None = None
-        self._listener = listener
 
     def stop(self) -> None:
         """Asks the stages to save their training and stop."""

@@ -60,7 +60,7 @@ def run(main: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one aborts the process.
+    """Calls `stop` at the first Ctrl-C or SIGTERM; the second one ends the process.
 
     Enter it in the main thread, where Python handles signals.
     """
@@ -71,15 +71,10 @@ def on_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         if (handler := signal.getsignal(number)) is not signal.SIG_IGN
     }
 
-    def end(number: int, frame: FrameType | None) -> None:
-        # Any other exit would wait for threads that compile or save.
-        with contextlib.suppress(OSError):
-            os.write(2, b"Aborted; earlier checkpoints are intact.\n")
-        os._exit(128 + number)
-
     def handle(number: int, frame: FrameType | None) -> None:
+        # Any other end would wait for threads that compile or save.
         for each in before:
-            signal.signal(each, end)
+            signal.signal(each, signal.SIG_DFL)
         stop()
 
     for number in before:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, as_completed
 
 import jax
@@ -14,14 +14,11 @@ from jaxsense import mission
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
-from jaxsense.mission.outcome import require_playable
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
-from jaxsense.run.compilation import Compiler, Kept
-from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.files import UNFINISHED, Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import OwnPolicies, Programs
+from jaxsense.run.programs import Programs
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
@@ -71,27 +68,6 @@ class Learned:
     results: blocks.Learned
 
 
-@contextlib.contextmanager
-def compiled(
-    config: Config,
-    monitor: Monitor,
-    workers: Workers = ALONE,
-    kept: Kept | None = None,
-    trainings: int = 0,
-    policies: OwnPolicies | None = None,
-) -> Iterator[Programs]:
-    """The programs of runs with the same settings, compiled in the background; see `Programs`.
-
-    Keep no programs with custom policies, whose code may change.
-
-    Raises:
-      ConfigError: see `require_playable`.
-    """
-    require_playable(config, policies)
-    with Compiler(monitor, kept) as compiler:
-        yield Programs(config, compiler, workers, trainings, policies)
-
-
 def learn(
     key: Key,
     config: Config,
@@ -101,15 +77,28 @@ def learn(
 ) -> Learned:
     """Trains everything and summarises it; see `train`."""
     trained = train(key, config, programs, monitor, checkpoints)
+    outputs, curves = trained.outputs, trained.curves
     scenario = monitor.wait_for(programs.player).mission
-    posteriors, latent = jax.tree.map(np.asarray, trained.outputs["latent_space"])
-    detections = jax.tree.map(np.asarray, trained.outputs["detections"])
-    beliefs = make.beliefs(trained.outputs["beliefs"])
+    posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
+    detections = jax.tree.map(np.asarray, outputs["detections"])
+    beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
     is_sound = compare.unsound(beliefs) is None
     # Measured of a JMVAE that learns from scans, and of no other.
-    grouped = {name: x for name, x in trained.outputs.items() if name == "grouped"}
+    grouped = {name: x for name, x in outputs.items() if name == "grouped"}
+
+    def agent(modality: str, values: Output) -> blocks.Agent:
+        others = jax.tree.map(np.asarray, outputs.get(f"numbers_{modality}", []))
+        return make.agent(
+            config,
+            jax.tree.map(np.asarray, outputs[f"policies_{modality}"]),
+            permutations(config),
+            curves[learner(config, modality)]["seconds"].tolist(),
+            dict(zip(config.evaluation.num_pois, others, strict=True)),
+            has_optimum(outputs["fusion"], values, is_sound),
+        )
+
     return Learned(
-        models=stages.models(trained.outputs, config),
+        models=stages.models(outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
             for sensor, windows in zip(scenario.world.sensors, detections.windows, strict=True)
@@ -119,17 +108,18 @@ def learn(
         posteriors=posteriors,
         rewards={
             network.removeprefix("dqn_"): {
-                name: trained.curves[network][name] for name in ("reward", "evaluation")
+                name: curves[network][name] for name in ("reward", "evaluation")
             }
             for network in (learner(config, n) for n in config.modalities)
         },
         results={
-            "detectors": jax.tree.map(
-                lambda x: np.asarray(x).tolist(), trained.outputs["detector_metrics"]
-            ),
-            "jmvae": make.jmvae(vars(latent) | grouped),
+            "detectors": make.plain(outputs["detector_metrics"]),
+            "jmvae": make.jmvae(latent | grouped),
             "belief": beliefs,
-            "dqn": {name: _agent(config, name, trained, is_sound) for name in config.modalities},
+            "dqn": {
+                name: agent(name, values)
+                for name, values in zip(config.modalities, outputs["look_values"], strict=True)
+            },
         },
     )
 
@@ -151,22 +141,7 @@ def play(
     of_run = {name: cases[name] for name in config.mission.policies}
     played = player.play(stages.mission_key(key), learned.models, of_run, episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
-    return played, make.missions(player.mission, played.metrics)
-
-
-def _agent(config: Config, modality: str, trained: Trained, is_sound: bool) -> blocks.Agent:
-    """One modality's block of `dqn`."""
-    rewards = jax.tree.map(np.asarray, trained.outputs[f"policies_{modality}"])
-    others = jax.tree.map(np.asarray, trained.outputs.get(f"numbers_{modality}", []))
-    fusion, values = trained.outputs["fusion"], trained.outputs["look_values"]
-    return make.agent(
-        config,
-        rewards,
-        permutations(config),
-        trained.curves[learner(config, modality)]["seconds"].tolist(),
-        dict(zip(config.evaluation.num_pois, others, strict=True)),
-        has_optimum(fusion, values[config.modalities.index(modality)], is_sound),
-    )
+    return played, make.missions(config, played.metrics)
 
 
 def train(

@@ -127,7 +127,7 @@ class Programs:
 
     def _compile_missions(self) -> None:
         config = self.config
-        with self._compiler.monitor.stopwatch.measure("compile_s", "mission"):
+        with self._compiler.monitor.measure("compile_s", "mission"):
             scenario = mission.make_mission(config, self._policies)
             scenario = scenario.playing(config.mission.policies)
         number = len(config.mission.policies) * config.mission.episodes

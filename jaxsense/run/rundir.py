@@ -3,14 +3,12 @@
 import contextlib
 import dataclasses
 import functools
-import io
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime
 from pathlib import Path
-from typing import cast
 
 import jax
 import numpy as np
@@ -18,22 +16,21 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError
-from jaxsense.config.plain import parse_json
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import inside
 from jaxsense.models import Models
 from jaxsense.run import files, output, version
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.settings import Settings, as_json, began, of_run, read_settings, resumable
-from jaxsense.summary.blocks import Made, Origin
+from jaxsense.summary.blocks import Origin
 from jaxsense.summary.compare import UNKNOWN
-from jaxsense.summary.read import ORIGINS, read_made
-from jaxsense.tasks.pretrained import PREFIX, load_pretrained
+from jaxsense.summary.read import ORIGINS, read_origins
+from jaxsense.tasks.registry import PREFIX, load_pretrained
 from jaxsense.training import stages
 from jaxsense.training.agents import learner
 
 _METRICS = "metrics.jsonl"
-_MOST_METRICS, _MOST_METRICS_LINE = 2**28, 2**16  # bytes
+_MOST_METRICS = 2**28  # bytes
 
 
 class RunDirectory:
@@ -47,9 +44,7 @@ class RunDirectory:
 
     def __init__(self, path: Path, settings: Settings):
         self.path, self.settings = path, settings
-        self.checkpoints = Checkpoints(path / "checkpoints", saved=self.sign)
-        self._made: list[Made] = []
-        self._reported: dict[str, int] = {}
+        self.checkpoints = Checkpoints(path / "checkpoints")
 
     @classmethod
     @contextlib.contextmanager
@@ -71,8 +66,8 @@ class RunDirectory:
             run = cls(place, settings)
             with _writable(place, "out"):
                 run._remove_partial()
-                _check_empty(place)  # once more: another process may have been faster
-                write_json(place / "config.json", as_json(settings))
+                # There is none, unless another process has been faster.
+                write_json(place / "config.json", as_json(settings), is_new=True)
             try:
                 yield run
             except (ConfigError, KeyboardInterrupt):
@@ -91,10 +86,7 @@ class RunDirectory:
         with _locked(path, "resume"):
             run = cls(path, settings)
             run._remove_partial()
-            run._made = read_made(path)
-            if not run._made and (path / "checkpoints").exists():
-                run._made = [{**UNKNOWN, "stage": "earlier stages"}]
-            run._read_metrics()
+            run._mend_metrics()
             yield run
 
     @property
@@ -126,29 +118,18 @@ class RunDirectory:
         return dataclasses.replace(self.settings, seed=seed, num_seeds=1)
 
     def append_metrics(self, *, stage: str, step: int, **metrics: float) -> None:
-        """Adds a line to `metrics.jsonl`, unless this run wrote it before it was killed.
+        """Adds a line to `metrics.jsonl`: metrics of a stage after so many steps."""
+        files.append(self.path / _METRICS, json.dumps({"stage": stage, "step": step, **metrics}))
 
-        Args:
-          stage: that reports.
-          step: number of steps so far.
-          **metrics: after that step.
-        """
-        if step > self._reported.get(stage, -1):
-            line = json.dumps({"stage": stage, "step": step, **metrics})
-            files.append(self.path / _METRICS, line)
-
-    def made(self, stage: str) -> list[Made]:
-        """What made each stage so far, and this process, which makes another."""
-        mine: Made = {**_process(), "stage": stage}
-        return self._made if mine in self._made else [*self._made, mine]
-
-    def sign(self, checkpoint: str) -> list[Made]:
-        """Writes to `origins.json` that this process made a checkpoint; returns its content."""
-        made = self.made(checkpoint.removeprefix("unfinished/").removeprefix("curves_"))
-        if made != self._made:
-            self._made = made
-            write_json(self.path / ORIGINS, made)
-        return made
+    def sign(self) -> list[Origin]:
+        """Adds this process to `origins.json`, those that have worked on the run; returns all."""
+        found = read_origins(self.path)
+        if not found and (self.path / "checkpoints").exists():
+            found.append(UNKNOWN)
+        if process() not in found[-1:]:
+            found.append(process())
+            write_json(self.path / ORIGINS, found)
+        return found
 
     def _remove_partial(self) -> None:
         """Removes partial files of a killed process; raises `OSError` if a link leads elsewhere."""
@@ -164,21 +145,14 @@ class RunDirectory:
                 for name in ours:
                     (self.path / name).unlink(missing_ok=True)
 
-    def _read_metrics(self) -> None:
-        """Reads the last step of each stage from `metrics.jsonl`, and cuts off a partial line."""
+    def _mend_metrics(self) -> None:
+        """Cuts off a partial line of `metrics.jsonl`."""
         path = self.path / _METRICS
-        if not os.path.lexists(path):
-            return
-        content = inside.read(path, _MOST_METRICS)
-        whole = content[: content.rfind(b"\n") + 1]
-        # Always, to find out at once whether the run can be written; and where the file is a link,
-        # lines go to a new one.
-        files.write(path, whole)
-        for line in io.BytesIO(whole):
-            with contextlib.suppress(ValueError, KeyError, TypeError, OverflowError):
-                found = cast(dict, parse_json(line[:_MOST_METRICS_LINE]))
-                stage, step = found["stage"], int(found["step"])
-                self._reported[stage] = max(step, self._reported.get(stage, -1))
+        if os.path.lexists(path):
+            content = inside.read(path, _MOST_METRICS)
+            # Always, to find out at once whether the run can be written; and where the file is a
+            # link, lines go to a new one.
+            files.write(path, content[: content.rfind(b"\n") + 1])
 
 
 def dated(name: str) -> Path:
@@ -210,7 +184,11 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
         is_new = path is None or not path.exists()
         path = path or dated(name)
         path.mkdir(parents=True, exist_ok=True)
-        _check_empty(path)
+        for each in path.iterdir():
+            # A process that was killed at once leaves these.
+            if each.name != ".lock" and not files.is_unfinished(each, "config.json"):
+                reason = "is not empty; must be a new or empty directory"
+                raise ConfigError("out", str(path), reason)
     try:
         yield path
     finally:
@@ -228,12 +206,6 @@ def _writable(path: Path, field: str) -> Iterator[None]:
         raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
 
 
-def _check_empty(path: Path) -> None:
-    """Raises `ConfigError` if a directory holds more than a lock and a partial `config.json`."""
-    if any(f.name != ".lock" and not files.is_unfinished(f, "config.json") for f in path.iterdir()):
-        raise ConfigError("out", str(path), "is not empty; must be a new or empty directory")
-
-
 @contextlib.contextmanager
 def _locked(path: Path, field: str) -> Iterator[None]:
     """Locks a directory; raises `ConfigError` about `field` if that cannot be done."""
@@ -243,18 +215,20 @@ def _locked(path: Path, field: str) -> Iterator[None]:
         yield
 
 
-def write_json(path: Path, content: Mapping[str, object] | Sequence[object]) -> None:
+def write_json(
+    path: Path, content: Mapping[str, object] | Sequence[object], *, is_new: bool = False
+) -> None:
     """Writes finite numbers, texts, lists and dictionaries as a JSON file for people."""
-    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    files.write(path, json.dumps(content, indent=2, allow_nan=False) + "\n", is_new=is_new)
 
 
 def origin() -> Origin:
     """How figures of this process are made."""
-    return {**_process(), "date": datetime.now().date().isoformat()}
+    return {**process(), "date": datetime.now().date().isoformat()}
 
 
 @functools.cache
-def _process() -> Origin:
+def process() -> Origin:
     """What is the same for all figures of this process."""
     found: Origin = {
         "versions": version.versions(),
@@ -310,11 +284,7 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
         raise ConfigError("run", str(path), f"holds several seeds; choose one, {path}/seed-...")
 
     def restore(name: str, shape: PyTree) -> PyTree:
-        found = checkpoints.load(name, shape, finite=True)
-        if found is None:
-            reason = f"must be a finished run (there is no checkpoint {name!r})"
-            raise ConfigError("run", str(path), reason)
-        return jax.device_put(found)
+        return jax.device_put(checkpoints.load(name, shape, finite=True))
 
     shapes = _named(jax.eval_shape(lambda: models.init(jax.random.key(0), config)), config)
     return config, stages.models({name: restore(name, x) for name, x in shapes.items()}, config)
@@ -352,20 +322,16 @@ def rewards(
     lengths |= {"seconds": epochs // config.dqn.chunk}
     shapes = {name: np.empty(length, np.float32) for name, length in lengths.items()}
 
-    def found(network: str) -> Iterator[dict[str, np.ndarray]]:
-        for directory in (run / "checkpoints" for run in runs):
-            reason = f"{directory}: holds no curves_{network}"
-            try:
-                if curves := Checkpoints(directory).load(f"curves_{network}", shapes):
-                    yield curves
-                    continue
-            except ConfigError as error:
-                reason = str(error)
-            warn(f"{reason}; left out of reward.svg")
+    def found(network: str, run: Path) -> dict[str, np.ndarray] | None:
+        try:
+            return Checkpoints(run / "checkpoints").load(f"curves_{network}", shapes)
+        except ConfigError as error:
+            warn(f"{error}; left out of reward.svg")
+            return None
 
     curves: dict[str, dict[str, np.ndarray]] = {}
     for network in dict.fromkeys(learner(config, name) for name in config.modalities):
-        of_runs = [*found(network)]
+        of_runs = [each for run in runs if (each := found(network, run))]
         curves[network.removeprefix("dqn_")] = {
             name: np.array([each[name] for each in of_runs]).reshape(-1, epochs)
             for name in ("reward", "evaluation")

@@ -140,9 +140,6 @@ def _require(
         raise ConfigError("seed", seed, "must be a whole number from 0 to 2^32 - 1")
     if not (isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)):
         raise ConfigError("policies", policies, "must be a dictionary from names to policies")
-    for name, each in policies.items():
-        if not callable(each):
-            raise ConfigError("policies", name, "must be a function")
     names = dict.fromkeys((*POLICIES, *policies))
     if not (isinstance(against, list | tuple) and against and all(n in names for n in against)):
         expected = f"must be a list of one or more of {', '.join(names)}"

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Annotated, TypeAlias
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
-from jaxsense.config.options import Name
-from jaxsense.config.plain import parse_json
+from jaxsense.config.options import Name, parse_json
 from jaxsense.config.section import Checked, limited, require
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions

@@ -15,12 +15,12 @@ SOFT = "#59616e"
 _ROBOTS = ("#8250c8", "#d9700a", "#0891a8", "#7d8a12")
 # They differ also for those who see no red or no green.
 _POLICIES = {
-    "latent": "#1558b0", "greedy": "#b84300", "bayes": "#00805f", "optimal": "#5e0d2b",
-    "nearest": "#cd79aa", "auction": "#d00dd4", "rollout": "#b79710", "naive": "#523a05",
-    "naive_2": "#05475b", "naive_3": "#d00e4d", "random": "#1711c8",
-}  # fmt: skip
-_STYLES = dict(zip(_POLICIES, zip(_POLICIES.values(), MARKERS, strict=True), strict=True))
-_OWN_POLICY = "#0fb851", "*"
+    "latent": "#1558b0",
+    "bayes": "#00805f",
+    "optimal": "#5e0d2b",
+    "naive": "#523a05",
+    "random": "#1711c8",
+}
 _APART = 0.25  # in RGB, which the eye distinguishes at a glance
 _TOGETHER = 0.05  # latent distance of classes that a picture cannot separate
 
@@ -31,13 +31,8 @@ def modality_colour(modality: int) -> str:
 
 
 def policy_colour(name: str) -> str:
-    """The colour of a policy, the same in all plots."""
-    return _STYLES.get(name, _OWN_POLICY)[0]
-
-
-def policy_marker(name: str) -> str:
-    """The marker of a policy, the same in all plots."""
-    return _STYLES.get(name, _OWN_POLICY)[1]
+    """The colour of a policy, the same in all plots; most have that of what matters less."""
+    return _POLICIES.get(name, SOFT)
 
 
 def class_colour(arena: ArenaConfig, label: str) -> str:

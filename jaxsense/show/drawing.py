@@ -21,15 +21,6 @@ _STYLE = """<style>text{font-family:system-ui,-apple-system,"Segoe UI",Roboto,sa
 @media (prefers-color-scheme:dark){svg,image{filter:invert(.91) hue-rotate(180deg)}}</style>"""
 
 
-def encoded(figure: Figure, path: Path) -> bytes:
-    """A figure as an SVG file if the path ends in `.svg`, else as a PNG file."""
-    if path.suffix == ".svg":
-        return svg(figure)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=120)
-    return content.getvalue()
-
-
 def svg(figure: Figure) -> bytes:
     """A figure as an SVG file, the same for the same figure, that is dark on a dark page."""
     content = io.StringIO()
@@ -54,9 +45,7 @@ def of_training(config: Config, learned: Learned) -> Pictures:
 
 def of_missions(config: Config, learned: Learned, played: Played, block: Missions) -> Pictures:
     """The plot of missions and the film of one, also under naive exploration."""
-    missions = {f"{config.mission.policies[0]} policy": played.recording}
-    if played.naive is not None:
-        missions["naive policy"] = played.naive
+    missions = {f"{name} policy": each for name, each in played.recordings.items()}
     films = film.draw(config, missions, learned.models.fusion, learned.fields_of_view)
     names = (f"{name}.svg" for name in page.OWN_FILMS)
     return {

@@ -130,16 +130,22 @@ def _draw(
     )
     add(root, "title", text)
     timeline = Timeline(shown / duration, add(root, "style", _STYLE))
-    probabilities = np.asarray(_class_probabilities(fusion, record.belief))
+    probabilities = np.asarray(jax.vmap(jax.vmap(fusion.class_probabilities))(record.belief))
     scene = _Scene(config, end, fusion, fields_of_view, record, probabilities, timeline)
     add(root, "rect", class_="film-paper", width=_WIDTH, height=height)
-    left, right = _half(root, 0, title), _half(root, 1, "the shared map")
+    halves = []
+    for place, name in ((10, title), (30 + _SIZE, "the shared map")):
+        half = add(root, "g", transform=f"translate({place} 0)")
+        add(half, "text", name, y=25, class_="film-title")
+        add(half, "rect", class_="film-floor", y=_TOP, width=_SIZE, height=_SIZE, rx=6)
+        halves.append((half, add(half, "svg", y=_TOP, width=_SIZE, height=_SIZE)))
+    (left, arena), (right, latent) = halves
     clock = [f"{t:.0f} s" for t in np.floor(record.time)]
     is_over = record.time >= seconds - 1e-3
     clock = np.where(is_over, f"{seconds:.1f} s", clock).tolist()
     timeline.strip(left, clock, x=_SIZE, y=25, class_="film-title film-end")
-    _draw_arena(_view(left), scene)
-    _draw_map(_view(right), scene)
+    _draw_arena(arena, scene)
+    _draw_map(latent, scene)
     below = _TOP + _SIZE + 24
     _draw_robots(left, scene, below)
     note = "Bars: probabilities; dots: sensors that saw it."
@@ -147,12 +153,6 @@ def _draw(
     for line, note in enumerate(_NOTES):
         add(right, "text", note, y=below + _LINE * line, class_="film-note")
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-@jax.jit
-def _class_probabilities(fusion: Fusion, belief: Belief) -> jax.Array:
-    """`[F, N, C]` of `[F, N, D]` beliefs."""
-    return jax.vmap(jax.vmap(fusion.class_probabilities))(belief)
 
 
 def _frames(config: Config, records: Record, prior: Belief, last: int) -> Record:
@@ -166,35 +166,18 @@ def _frames(config: Config, records: Record, prior: Belief, last: int) -> Record
     return record
 
 
-def _half(parent: Element, number: int, title: str) -> Element:
-    half = add(parent, "g", transform=f"translate({10 + number * (_SIZE + 20)} 0)")
-    add(half, "text", title, y=25, class_="film-title")
-    return half
-
-
-def _view(half: Element) -> Element:
-    """Adds the floor of a view, and what shows no more than the view."""
-    add(half, "rect", class_="film-floor", y=_TOP, width=_SIZE, height=_SIZE, rx=6)
-    return add(half, "svg", y=_TOP, width=_SIZE, height=_SIZE)
-
-
 def _draw_robots(parent: Element, scene: _Scene, y: float) -> None:
     """Draws a line for each robot: its colour, its name and what it does."""
     config, record = scene.config, scene.record
     for r, named in enumerate(config.robot_names):
         colour = modality_colour(config.modality_of_robot[r])
         add(parent, "circle", cx=9, cy=y - 6 + _LINE * r, r=7, fill=colour)
-        doing = [
-            f"{named.replace('_', ' ')}: {_doing(int(phase), int(target), config.arena.num_pois)}"
-            for phase, target in zip(record.phase[:, r], record.target[:, r], strict=True)
-        ]
+        doing = []
+        for phase, target in zip(record.phase[:, r], record.target[:, r], strict=True):
+            has_target = 1 <= phase <= 3 and target < config.arena.num_pois
+            words = f"{named.replace('_', ' ')}: {_PHASES[phase]}"
+            doing.append(f"{words} {target + 1}" if has_target else words)
         scene.timeline.strip(parent, doing, x=28, y=y + _LINE * r, class_="film-line")
-
-
-def _doing(phase: int, target: int, num_pois: int) -> str:
-    """A robot's phase in words."""
-    has_target = 1 <= phase <= 3 and target < num_pois
-    return f"{_PHASES[phase]} {target + 1}" if has_target else _PHASES[phase]
 
 
 def _draw_arena(parent: Element, scene: _Scene) -> None:
@@ -340,8 +323,9 @@ def _draw_map(parent: Element, scene: _Scene) -> None:
         for name, each in zip(("cx", "cy", "rx", "ry"), values, strict=True):
             timeline.animate(ellipse, name, each)
         timeline.animate(ellipse, "opacity", is_seen[:, n], jumps=True)
-        number = add(numbers, "g")
-        timeline.animate(number, "translate", mean + _beside(n))
+        number, (row, column) = add(numbers, "g"), divmod(n, _ABREAST)
+        # Others may share the place.
+        timeline.animate(number, "translate", mean + np.array([18 * column - 27, 15 * row - 6]))
         text = add(number, "text", str(n + 1), class_="film-number film-on-light", fill=colour)
         timeline.animate(text, "opacity", is_seen[:, n], jumps=True)
     for c, (label, (x, y)) in enumerate(
@@ -351,9 +335,3 @@ def _draw_map(parent: Element, scene: _Scene) -> None:
         half = _LETTER * len(label)
         at = {"x": np.clip(x, half, _SIZE - half), "y": y + side * (scale * stds[c, 1] + 12) + 5}
         add(parent, "text", label, class_="film-label film-on-light", fill=scene.colours[c], **at)
-
-
-def _beside(n: int) -> np.ndarray:
-    """Where the number of a PoI stands from its place in the map, which others may share."""
-    row, column = divmod(n, _ABREAST)
-    return np.array([18 * column - 27, 15 * row - 6])

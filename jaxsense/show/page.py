@@ -5,7 +5,7 @@ import contextlib
 import json
 import re
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -14,11 +14,11 @@ import jinja2
 from markupsafe import Markup
 
 from jaxsense.config import PRESETS, Config, as_plain
-from jaxsense.config.options import command
+from jaxsense.config.options import command, flat
 from jaxsense.core import inside
 from jaxsense.show import tables
 from jaxsense.summary import compare
-from jaxsense.summary.blocks import Evaluation, Missions, Summary, cases, mean
+from jaxsense.summary.blocks import Evaluation, Missions, Summary, mean
 from jaxsense.summary.read import EVALUATIONS
 
 OWN_FILMS = ("mission", "mission-naive")
@@ -63,7 +63,6 @@ def render(
         trust=" --trust" if config.named_code else "",
         summary=summary,
         remarks=compare.remarks(summary),
-        cards=tables.cards(summary),
         missions=[here, *elsewhere],
         learned=[
             tables.detectors(summary),
@@ -71,7 +70,6 @@ def render(
             tables.latent_space(summary),
             tables.unambiguous(summary, config.arena.classes),
         ],
-        paper=tables.paper(summary),
         times=tables.times(summary, summary["timing"]),
         counted=tables.counted,
         changed=_changed(config, summary["preset"]),
@@ -127,23 +125,21 @@ def _films(run: Path) -> list[dict[str, Markup]]:
 
 def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
     """Section of the page about missions in the same arenas."""
-    played = cases(missions)
-    number = max(mean(case["episodes"]) for case in played.values())
+    number = max(mean(case["episodes"]) for case in missions.values())
     caption = f"{number:,.0f} missions of each policy, in the same arenas"
     found = [tables.missions(missions, caption), tables.failures(missions)]
     return {
         "title": title,
-        "verdict": compare.verdict(played),
+        "verdict": compare.verdict(missions),
         "tables": [table for table in found if table.rows],
         "details": tables.all_of_missions(missions),
-        "sizes": compare.detection_sizes(missions),
         "plot": _picture(plot),
     }
 
 
 def _title(found: Evaluation, summary: Summary) -> str:
     """What was evaluated, and with what where that is not what finished the run."""
-    seeds = {case.get("seed", 0) for case in cases(found["mission"]).values()}
+    seeds = {case.get("seed", 0) for case in found["mission"].values()}
     changed = compare.differences_of([summary, found.get("origin", compare.UNKNOWN)])
     made = "".join(f"; {name} {value}" for name, (_, value) in changed.items())
     return (
@@ -161,18 +157,9 @@ def _picture(path: Path) -> str | None:
 
 def _changed(config: Config, preset: str) -> dict[str, tuple[str, str]]:
     """Settings that differ from the preset's: their value, and the preset's."""
-    before = dict(_flat(as_plain(PRESETS.get(preset, config))))
+    before = flat(as_plain(PRESETS.get(preset, config)))
     return {
         name: (json.dumps(value), json.dumps(before.get(name)))
-        for name, value in _flat(as_plain(config))
+        for name, value in flat(as_plain(config)).items()
         if value != before.get(name)
     }
-
-
-def _flat(settings: Mapping[str, object], prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Nested settings as `section.name`."""
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

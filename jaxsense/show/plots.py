@@ -1,16 +1,14 @@
 """The plots of a run: latent space, looks, calibration, learning, and policies in missions."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import jax
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxsense.config import Config
@@ -24,20 +22,16 @@ from jaxsense.show.colours import (
     modality_colour,
     plane,
     policy_colour,
-    policy_marker,
 )
-from jaxsense.show.tables import counted
 from jaxsense.summary.blocks import (
     AGENTS,
     MISSIONS,
     Agent,
     Beliefs,
-    Evaluation,
     Missions,
     Number,
     mean,
 )
-from jaxsense.summary.blocks import cases as cases_of
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.compare import bounds
 
@@ -48,10 +42,6 @@ rewards: `reward` of the exploring policy, and `evaluation` of the learned polic
 NaN where it was not played."""
 
 _MOST = 20  # ellipses of a class
-_MANY_CLASSES = 9
-_MANY_TOGETHER = 3  # classes in one place, above which their names take too much room
-_NEAR = 0.2  # sigma, between classes in one place
-_DASH = 5.0  # points, of ellipses of classes in one place
 _CLASS_ROW = 0.24  # inches, of a class in the plot of sigma
 _LOOK_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
@@ -65,8 +55,8 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     """The paper's Fig. 4: posteriors of held-out detections as 1-sigma ellipses, and `||sigma||`.
 
     The first column shows detections by all modalities together, the others by each alone, in the
-    two latent dimensions that show classes farthest apart. Where classes share a place, their
-    dashes alternate.
+    two latent dimensions that show classes farthest apart. Markers and colours of classes are those
+    below, beside their names.
 
     Args:
       config: all settings.
@@ -84,7 +74,7 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     flat = {n: jax.tree.map(lambda x: in_plane(x, dimensions), b) for n, b in shown.items()}
     for top, bottom, name in zip(above, below, names, strict=True):
         top.set_title(" & ".join(config.modalities) if name == "joint" else f"{name} alone")
-        _draw_beliefs(top, flat[name], classes, colours)
+        _draw_beliefs(top, flat[name], colours)
         _draw_norms(bottom, np.linalg.norm(shown[name].std, axis=-1), colours)
         top.set_xlabel(f"latent dimension {dimensions[0] + 1}")
         top.set_aspect("equal", adjustable="box")
@@ -92,42 +82,23 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     above[0].set_ylabel(f"latent dimension {(*dimensions, 1)[1] + 1}")
     below[0].set_yticks(range(len(classes)), classes)
     below[0].set_ylim(len(classes) - 0.5, -0.5)
-    # A square around all ellipses, with room for the names of classes.
+    # A square around all ellipses.
     low = np.min([belief.mean - belief.std for belief in flat.values()], axis=(0, 1, 2))
     high = np.max([belief.mean + belief.std for belief in flat.values()], axis=(0, 1, 2))
-    (x, y), half = (low + high) / 2, 0.68 * np.max(high - low)
+    (x, y), half = (low + high) / 2, 0.55 * np.max(high - low)
     above[0].set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     return figure
 
 
-def _draw_beliefs(ax: Axes, belief: Belief, classes: Sequence[str], colours: Sequence[str]) -> None:
-    """Draws `[C, S, 2]` beliefs and the names of their classes."""
+def _draw_beliefs(ax: Axes, belief: Belief, colours: Sequence[str]) -> None:
+    """Draws `[C, S, 2]` beliefs."""
     mean, std = np.asarray(belief.mean), np.asarray(belief.std)
-    centre, spread = np.median(mean, axis=1), np.median(std, axis=1)
-    for together in _groups(centre, spread):
-        for place, c in enumerate(together):
-            dash = (place * _DASH, (_DASH, _DASH * (len(together) - 1)))
-            style: dict[str, Any] = {"facecolors": "none", "edgecolors": colours[c]}
-            patches = [Ellipse(m, *(2 * s)) for m, s in zip(mean[c], std[c], strict=True)]
-            line = "-" if len(together) == 1 else dash
-            ax.add_collection(PatchCollection(patches, alpha=0.5, linestyles=[line], **style))
-            # Hollow and of another shape, so that classes in one place are all seen.
-            ax.scatter(*mean[c].T, s=30, marker=MARKERS[c % len(MARKERS)], linewidths=1.0, **style)
-        first, names = together[0], [classes[c] for c in together]
-        if len(names) > _MANY_TOGETHER:
-            names[_MANY_TOGETHER - 1 :] = [f"{len(names) - _MANY_TOGETHER + 1} more"]
-        name = ax.annotate(
-            "\n".join(names),
-            (centre[first, 0], centre[first, 1] + max(spread[c, 1] for c in together)),
-            (0, 4),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            fontsize=9 if len(classes) <= _MANY_CLASSES else 6.5,
-            path_effects=[withStroke(linewidth=3, foreground="white")],
-        )
-        # Room for a long name would leave none for the axes.
-        name.set_in_layout(False)
+    for c, colour in enumerate(colours):
+        style: dict[str, Any] = {"facecolors": "none", "edgecolors": colour}
+        patches = [Ellipse(m, *(2 * s)) for m, s in zip(mean[c], std[c], strict=True)]
+        ax.add_collection(PatchCollection(patches, alpha=0.5, **style))
+        # Hollow and of another shape, so that classes in one place are all seen.
+        ax.scatter(*mean[c].T, s=30, marker=MARKERS[c % len(MARKERS)], linewidths=1.0, **style)
 
 
 def _draw_norms(ax: Axes, norms: np.ndarray, colours: Sequence[str]) -> None:
@@ -138,18 +109,6 @@ def _draw_norms(ax: Axes, norms: np.ndarray, colours: Sequence[str]) -> None:
         style = {"facecolors": "none", "edgecolors": colours[c], "linewidths": 0.8}
         ax.scatter(of_class, heights, s=14, marker=MARKERS[c % len(MARKERS)], **style)
     ax.grid(axis="x", alpha=0.3)
-
-
-def _groups(centre: np.ndarray, spread: np.ndarray) -> list[list[int]]:
-    """Classes with `[C, 2]` centres, those in one place together."""
-    found, waiting = [], list(range(len(centre)))
-    while waiting:
-        first = waiting[0]
-        apart = (centre[waiting] - centre[first]) / np.maximum(spread[first], 1e-6)
-        is_near = np.linalg.norm(apart, axis=-1) < _NEAR
-        found.append([c for c, near in zip(waiting, is_near, strict=True) if near])
-        waiting = [c for c in waiting if c not in found[-1]]
-    return found
 
 
 def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
@@ -287,7 +246,10 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
     right.plot(belief["looks"], belief["bayes_nll"], "s--", label="exact Bayes", **style)
     right.set(xlabel="looks", ylabel="NLL of the true class [nats]", yscale="log")
     right.set_xticks(belief["looks"])
-    _number(right.yaxis)
+    # Plain numbers on the logarithmic axis.
+    right.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    right.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    right.yaxis.set_minor_formatter(NullFormatter())
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend(ncols=3, **_ABOVE)
@@ -309,8 +271,9 @@ def policies(block: Missions) -> Figure:
         for y, name in enumerate(names):
             case = cast(dict[str, Number], played[name])
             error = _error(case[key], cast(dict, case.get("intervals", {})).get(difference))
-            style = {"fmt": policy_marker(name), "color": policy_colour(name), "capsize": 3}
-            ax.errorbar(mean(case[key]), y, xerr=error, **style)
+            ax.errorbar(
+                mean(case[key]), y, xerr=error, fmt="o", color=policy_colour(name), capsize=3
+            )
         ax.set(xlabel=MISSIONS[key].label, ylim=(-0.7, len(names) - 0.3))
         ax.set_xlim(0, 1.05 * ax.dataLim.x1)
         ax.grid(axis="x", alpha=0.3)
@@ -329,42 +292,3 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
         case {"mean": float(middle), "low": float(low), "high": float(high)}:
             return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
     return None
-
-
-def places(evaluations: Iterable[Evaluation]) -> Figure:
-    """Median time of missions of every policy, a row for each arena and team.
-
-    Args:
-      evaluations: missions; of the same arena and team, those with the most are shown.
-    """
-
-    def size(place: Evaluation) -> float:
-        return max(mean(case["episodes"]) for case in cases_of(place["mission"]).values())
-
-    largest = {_place(each): each for each in sorted(evaluations, key=size)}
-    names = sorted(largest, key=lambda name: (largest[name]["num_pois"], largest[name]["robots"]))
-    figure = Figure(figsize=(10, 1.6 + 0.4 * len(names)), layout="constrained")
-    ax = figure.subplots()
-    played = {name: policies_of(largest[name]["mission"]) for name in names}
-    for policy in dict.fromkeys(policy for each in played.values() for policy in each):
-        rows = [y for y, name in enumerate(names) if policy in played[name]]
-        times = [mean(played[names[y]][policy]["time_s"]) for y in rows]
-        marker, colour = policy_marker(policy), policy_colour(policy)
-        ax.plot(times, rows, marker, color=colour, label=policy, markerfacecolor="none")
-    ax.set_yticks(range(len(names)), names)
-    ax.set(xlabel=MISSIONS["time_s"].label, xscale="log", ylim=(-0.7, len(names) - 0.3))
-    _number(ax.xaxis)
-    ax.grid(alpha=0.3)
-    ax.legend(**_BESIDE)
-    return figure
-
-
-def _place(found: Evaluation) -> str:
-    return f"{found['num_pois']} PoIs in {found['side']:g} m: {counted(found['robots'])}"
-
-
-def _number(axis: Axis) -> None:
-    """Writes plain numbers to a logarithmic axis."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(NullFormatter())

@@ -18,27 +18,10 @@ from jaxsense.summary.blocks import (
     Number,
     Results,
     Timing,
-    cases,
     mean,
     policies,
-    text,
 )
-from jaxsense.summary.compare import AS_ACCURATE
 
-# Table I of Korthals et al. 2018: the classes that a sensor alone identifies.
-_PAPER_CLASSES = {"green cylinder", "red cylinder", "red cube"}
-_PAPER_CERTAIN = {("green cylinder", "camera"), ("red cube", "lidar")}
-_PAPER_PERMUTATIONS = 384  # states of the paper's task
-_PAPER = {
-    "return": "Fig. 5",
-    "optimal": "0.550*",
-    "one_step.policy": "0.340, 0.385*",
-    "one_step.optimal": "0.426*",
-    "one_step.random": "-0.302*",
-    "optimal_permutations": "",
-    "num_permutations": "384",
-    "env_steps": "2,000 epochs",
-}
 _YES_OR_NO = {0.0: "no", 1.0: "yes"}
 
 
@@ -51,14 +34,12 @@ class Table:
       columns: their names.
       rows: the name of each, and a text for each column.
       meanings: explanations, by names of columns.
-      best: rows and columns of values to highlight.
     """
 
     caption: str
     columns: list[str]
     rows: list[tuple[str, list[str]]]
     meanings: dict[str, str] = dataclasses.field(default_factory=dict)
-    best: frozenset[tuple[int, int]] = frozenset()
 
 
 def _table(
@@ -96,52 +77,35 @@ def latent_space(results: Results) -> Table:
 
 
 def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
-    """Classes that each sensor alone, and all together, identify with certainty.
+    """Classes that each sensor alone, and all together, identify with certainty (Table I).
 
-    Next to each is the paper's result if it has the same classes and sensors. Raises `ConfigError`
-    if the results are of other `classes`.
+    Raises `ConfigError` if the results are of other `classes`.
     """
     block = results["jmvae"]
     columns = sorted(block["unambiguous"], key="joint".__eq__)
     blocks = block["unambiguous"], block["consistent"], block["sigma_norm"]
     if {len(each.get(name, ())) for each in blocks for name in columns} - {len(classes)}:
         raise ConfigError("jmvae", columns, f"must each have a value for {len(classes)} classes")
-    is_paper = set(classes) == _PAPER_CLASSES and set(columns) == {"camera", "lidar", "joint"}
 
     def cell(c: int, name: str) -> str:
         holds, consistent, norm = (mean(each[name][c]) for each in blocks)
         here = _YES_OR_NO.get(holds, f"{holds:.0%}")  # of several seeds
-        if is_paper:
-            here += f" / {_YES_OR_NO[name == 'joint' or (classes[c], name) in _PAPER_CERTAIN]}"
         return f"{here} ({consistent:.1%}, {norm:.2f})"
 
-    caption = "Classes identified with certainty" + is_paper * " Here / in the paper's Table I"
     rows = [(label, [cell(c, name) for name in columns]) for c, label in enumerate(classes)]
     brackets = "Share of looks that leave exactly the classes that this sensor cannot tell apart; "
-    brackets += "mean sigma norm, in the paper's Fig. 4 from 1.05 to 1.25."
-    return Table(caption, columns, rows, {"In brackets": brackets})
-
-
-def paper(results: Results) -> Table | None:
-    """The Q-networks compared with the paper's; None if its task is another."""
-    agents = results["dqn"]
-    if any(mean(agent["num_permutations"]) != _PAPER_PERMUTATIONS for agent in agents.values()):
-        return None
-    rows = [
-        (AGENTS[key].label, [*(AGENTS[key].text(agent) for agent in agents.values()), there or "-"])
-        for key, there in _PAPER.items()
-    ]
-    return Table("Comparison with the paper", [*agents, "paper"], rows)
+    brackets += "mean sigma norm."
+    return Table("Classes identified with certainty", columns, rows, {"In brackets": brackets})
 
 
 def missions(block: Missions, caption: str) -> Table:
-    """The policies that played in the same arenas, with the best values marked."""
+    """The policies that played in the same arenas."""
     return _missions(policies(block), caption)
 
 
 def failures(block: Missions) -> Table:
     """The missions of a block `mission` in which a robot fails."""
-    failing = {name: case for name, case in cases(block).items() if is_fault(name)}
+    failing = {name: case for name, case in block.items() if is_fault(name)}
     return _missions(failing, "The latent policy, with a robot that is alone, stops or goes blind")
 
 
@@ -149,15 +113,11 @@ _CAPTIONS = {
     "": "Maps, looks and time",
     "calibration": "Calibration of the maps",
     "intervals": "Difference from the latent policy in the same arenas, with 95 % intervals",
-    "of_naive": "Ratio to naive exploration of the same accuracy",
 }
-_UNFINISHED = {
-    "unfinished": (
-        "Missions that no robot ended by choice: after `mission.time_limit`, or because a PoI was "
-        "unreachable or showed nothing, no look would have been new, or robots failed."
-    ),
-    "in bold": "The best value among policies that are as accurate as the best one.",
-}
+_UNFINISHED = (
+    "Missions that no robot ended by choice: after `mission.time_limit`, or because a PoI was "
+    "unreachable or showed nothing, no look would have been new, or robots failed."
+)
 
 
 def _missions(played: Mapping[str, Case], caption: str) -> Table:
@@ -168,28 +128,13 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
         words = (f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items())
         rows.append((name, [*texts, ", ".join(words)]))
-    columns, meanings = [*table.columns, "unfinished"], {**table.meanings, **_UNFINISHED}
+    columns, meanings = [*table.columns, "unfinished"], table.meanings | {"unfinished": _UNFINISHED}
     if "naive" in played:
         columns.insert(3, "against naive")
         meanings["against naive"] = "Difference of the median times."
         for (_, texts), case in zip(rows, played.values(), strict=True):
             texts.insert(3, _percent(case["time_s"], played["naive"]["time_s"]))
-    values = [[mean(case[key]) for key in keys[:3]] for case in played.values()]
-    return Table(caption, columns, rows, meanings, _best(values))
-
-
-def _best(values: list[list[float]]) -> frozenset[tuple[int, int]]:
-    """The highest accuracy, and the least looks and time of the rows that are about as accurate."""
-    most = max((accuracy for accuracy, *_ in values), default=0.0)
-    able = [row for row in values if row[0] >= most - AS_ACCURATE]
-    least = [min(column) for column in zip(*able, strict=True)]
-    found = set[tuple[int, int]]()
-    for r, row in enumerate(values):
-        # A value alone is not the best of any.
-        found |= {(r, 0)} if row[0] == most and len(values) > 1 else set()
-        if row in able and len(able) > 1:
-            found |= {(r, c) for c in (1, 2) if row[c] == least[c]}
-    return frozenset(found)
+    return Table(caption, columns, rows, meanings)
 
 
 def all_of_missions(block: Missions) -> list[Table]:
@@ -198,7 +143,7 @@ def all_of_missions(block: Missions) -> list[Table]:
     for key, metric in MISSIONS.items():
         if key not in ("seed", "ended"):
             groups[_CAPTIONS[key.rpartition(".")[0]]].append(metric)
-    found = [_table(caption, cases(block), metrics) for caption, metrics in groups.items()]
+    found = [_table(caption, block, metrics) for caption, metrics in groups.items()]
     return [table for table in found if table.rows]
 
 
@@ -208,26 +153,6 @@ def _percent(value: Number, reference: Number) -> str:
         return "-"
     percent = round(100 * (mean(value) / mean(reference) - 1))
     return f"{percent:+d}\u00a0%" if percent else "="
-
-
-def cards(results: Results) -> list[tuple[str, str, str]]:
-    """The main results: a number, its meaning, and figures to compare it with."""
-    found, played = [], cases(results["mission"])
-    for key, what in (
-        ("observations_per_poi", "looks per PoI"),
-        ("time_s", "median seconds per mission"),
-        ("accuracy", "of PoIs right"),
-    ):
-        number = {name: mean(case[key]) for name, case in played.items()}
-        shown = {name: text(value, MISSIONS[key].digits) for name, value in number.items()}
-        beside = [f"{name} {shown[name]}" for name in ("naive", "random") if name in played]
-        if "latent" in played:
-            found.append((shown["latent"], what, ", ".join(beside)))
-    for modality, agent in results["dqn"].items():
-        if agent["optimal_states"] is not None:  # with an optimum to compare with
-            what = f"of {mean(agent['num_states']):,.0f} states of the map played optimally"
-            found.append((f"{mean(agent['optimal_states']):,.0f}", what, modality))
-    return found
 
 
 def times(results: Results, timing: Timing) -> list[Table]:

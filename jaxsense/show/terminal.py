@@ -1,6 +1,5 @@
 """Shows the progress of a program: on a terminal, as lines, or as event files for TensorBoard."""
 
-import importlib
 import io
 import time
 from collections.abc import Callable, Sequence
@@ -13,7 +12,6 @@ import rich.text
 from rich import progress
 from rich.table import Column
 
-from jaxsense.config import ConfigError
 from jaxsense.core import inside
 from jaxsense.run.output import say
 from jaxsense.show.tables import Table
@@ -99,12 +97,8 @@ def as_text(console: rich.console.Console, table: Table) -> str:
     drawn.title = rich.text.Text(table.caption)
     for name in table.columns:
         drawn.add_column(rich.text.Text(name), justify="right")
-    for r, (name, values) in enumerate(table.rows):
-        cells = (
-            rich.text.Text(value, "bold" if (r, i) in table.best else "")
-            for i, value in enumerate(values)
-        )
-        drawn.add_row(rich.text.Text(name), *cells)
+    for name, values in table.rows:
+        drawn.add_row(*map(rich.text.Text, (name, *values)))
     if not console.is_terminal:
         # Even the nothing that it writes while it is captured fails on a full disk.
         nowhere = io.TextIOWrapper(io.BytesIO(), getattr(console.file, "encoding", None))
@@ -112,15 +106,6 @@ def as_text(console: rich.console.Console, table: Table) -> str:
     with console.capture() as captured:
         console.print(drawn)
     return captured.get().removesuffix("\n")
-
-
-def require_tensorboard() -> None:
-    """Raises `ConfigError` unless tensorboardX is installed."""
-    try:
-        importlib.import_module("tensorboardX")
-    except ImportError:
-        reason = "needs tensorboardX: pip install 'jaxsense[tensorboard]'"
-        raise ConfigError("tensorboard", True, reason) from None
 
 
 def tensorboard(path: Path) -> Callable[..., None]:

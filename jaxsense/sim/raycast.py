@@ -145,15 +145,12 @@ def cross_section(
     """
     if not -1 <= robot < arena.num_robots:
         raise ValueError(f"robot = {robot}: must be -1 or one of the {arena.num_robots} robots")
-    kinds = arena.mj_model.geom_type
-    seen = [
-        g
-        for g in range(arena.mj_model.ngeom)
-        if arena.mj_model.geom_group[g] == _VISIBLE_GROUP
-        and (robot < 0 or arena.robot_of_geom[g] != robot)
-    ]
-    cylinders = tuple(g for g in seen if kinds[g] == mjx.GeomType.CYLINDER)
-    boxes = tuple(g for g in seen if kinds[g] == mjx.GeomType.BOX)
+    model = arena.mj_model
+    is_seen = (model.geom_group == _VISIBLE_GROUP) & ((robot < 0) | (arena.robot_of_geom != robot))
+    cylinders, boxes = (
+        tuple(np.flatnonzero(is_seen & (model.geom_type == kind)).tolist())
+        for kind in (mjx.GeomType.CYLINDER, mjx.GeomType.BOX)
+    )
     geoms = cylinders + boxes
     ids = jnp.array(geoms, jnp.int32)
     position, size = data.geom_xpos[ids], arena.model.geom_size[ids]

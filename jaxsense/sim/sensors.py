@@ -50,7 +50,6 @@ class Sensor(abc.ABC):
       window: number of rays that the detector reads.
       channels: numbers in the reading of one ray.
       stride: step between the rays that the detector reads.
-      ray_bytes: size of one ray's reading in a ROS message.
       window_limit: highest reading in the detector's input.
       measures_distance: whether readings are distances in metres.
       blind: reading of every ray after the sensor has failed.
@@ -63,7 +62,6 @@ class Sensor(abc.ABC):
     window: int = struct.field(pytree_node=False)
     channels: int = struct.field(pytree_node=False, default=1)
     stride: int = struct.field(pytree_node=False, default=1)
-    ray_bytes: int = struct.field(pytree_node=False, default=4)  # float32
     measures_distance: bool = struct.field(pytree_node=False, default=False)
     window_limit: float | jax.Array = np.inf
     blind: float | jax.Array = 0.0
@@ -147,11 +145,6 @@ class Sensor(abc.ABC):
         """Unit vectors along the rays in the robot's frame."""
         angles = self.angles.astype(np.float64)
         return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
-
-    @property
-    def scan_bytes(self) -> int:
-        """Size of a whole scan in a ROS message, in bytes."""
-        return self.ray_bytes * len(self.angles)
 
 
 class Lidar(Sensor):
@@ -263,7 +256,6 @@ def camera(config: CameraConfig) -> Camera:
         channels=3,
         stride=config.stride,
         window_limit=1.0,
-        ray_bytes=3,  # rgb8
     )
 
 

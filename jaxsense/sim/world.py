@@ -152,20 +152,19 @@ def look(
         )
     bearing, distance = _believed(error_key, world, pose, bearing, layout.position[poi])
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
-    data = arenas.place(world.arena, layout, scene.poses)
-    return (window_around(noise_key, world, scene, data, robot, bearing), distance), scene
+    return (window_around(noise_key, world, scene, robot, bearing), distance), scene
 
 
 def window_around(
     key: Key,
     world: World,
     scene: Scene,
-    data: mjx.Data,
     robot: int,
     bearing: Float[Array, ""],
     twin: Float[Array, "2"] | None = None,
 ) -> Float[Array, "F"]:
     """Input of the detector of a robot's own sensor, see `scan_around`."""
+    data = arenas.place(world.arena, scene.layout, scene.poses)
     readings = scan_around(key, world, scene, data, robot, bearing, robot, twin=twin)
     return windows.as_window(world.sensors[robot], readings)
 
@@ -222,41 +221,34 @@ def survey(
     robots, pois = jnp.arange(len(world.sensors)), jnp.arange(world.arena.config.num_pois)
     shape = (len(robots), len(pois))
 
-    def stand(key: Key, robot: jax.Array, poi: jax.Array) -> tuple[View, mjx.Data]:
-        standing = others(scene.poses, robot)
+    away = jnp.array(viewpoints.outside(world.arena.config))
+
+    def view_of(key: Key, robot: jax.Array, poi: jax.Array) -> View:
         pose_key, error_key, absent_key = jax.random.split(key, 3)
-        pose, bearing = _viewpoint(pose_key, world, scene.layout, standing, poi)
+        pose, bearing = _viewpoint(pose_key, world, scene.layout, others(scene.poses, robot), poi)
         bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
-        view = View(
-            positions=scene.layout.position,
-            poses=scene.poses.at[robot].set(pose),
-            twin=jnp.array(viewpoints.outside(world.arena.config)),
-            bearing=bearing,
-            distance=distance,
+        poses = scene.poses.at[robot].set(pose)
+        view = View(scene.layout.position, poses, away, bearing, distance)
+        if is_empty is None:
+            return view
+        absent = viewpoints.without_poi(
+            absent_key, world.sensors, world.arena.config, world.viewpoint, view, robot, poi
         )
-        if is_empty is not None:
-            arena, viewpoint = world.arena.config, world.viewpoint
-            absent = viewpoints.without_poi(
-                absent_key, world.sensors, arena, viewpoint, view, robot, poi
-            )
-            view = jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
-        layout = dataclasses.replace(scene.layout, position=view.positions)
-        return view, arenas.place(world.arena, layout, view.poses)
+        return jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
 
-    of_pois = jax.vmap(stand, in_axes=(0, None, 0))
+    of_pois = jax.vmap(view_of, in_axes=(0, None, 0))
     each = jax.vmap(of_pois, in_axes=(0, 0, None))
-    views, data = each(jax.random.split(viewpoint_key, shape), robots, pois)
-
+    views = each(jax.random.split(viewpoint_key, shape), robots, pois)
     noise_keys = jax.random.split(noise_key, shape)
 
     def read_all(robot: int) -> jax.Array:
-        def read(key: Key, view: View, data: mjx.Data) -> jax.Array:
-            stood = dataclasses.replace(scene, poses=view.poses)
+        def read(key: Key, view: View) -> jax.Array:
+            layout = dataclasses.replace(scene.layout, position=view.positions)
+            stood = Scene(layout, scene.light, view.poses)
             twin = None if is_empty is None else view.twin
-            return window_around(key, world, stood, data, robot, view.bearing, twin)
+            return window_around(key, world, stood, robot, view.bearing, twin)
 
-        view, state = jax.tree.map(lambda x: x[robot], (views, data))
-        return jax.vmap(read)(noise_keys[robot], view, state)
+        return jax.vmap(read)(noise_keys[robot], jax.tree.map(lambda x: x[robot], views))
 
     return scene, tuple(map(read_all, range(len(world.sensors)))), views.distance
 

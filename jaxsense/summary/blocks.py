@@ -6,7 +6,7 @@ stands in place of each number.
 
 import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Annotated, NotRequired, TypedDict, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, NotRequired, TypedDict, get_args, get_origin, get_type_hints
 from typing import is_typeddict as is_block
 
 from jaxsense.mission.outcome import is_fault
@@ -184,14 +184,6 @@ class Differences(TypedDict):
     time_s: Annotated[Interval, Metric("mean time, difference [s]", digits=1)]
 
 
-class OfNaive(TypedDict):
-    """`mission.POLICY.of_naive`: ratios to naive exploration, see `compare.of_naive`."""
-
-    observations_per_poi: Annotated[float, Metric("looks, relative to naive", digits=2)]
-    time_s: Annotated[float, Metric("median time, relative to naive", digits=2)]
-    mean_time_s: Annotated[float, Metric("mean time, relative to naive", digits=2)]
-
-
 class Calibration(TypedDict):
     """`mission.POLICY.calibration`: maps at the end of missions, PoIs that were detected."""
 
@@ -219,20 +211,10 @@ class Case(TypedDict):
     ]
     seed: NotRequired[Annotated[int, Metric("seed", "Seed of the arenas of an evaluation.")]]
     intervals: NotRequired[Differences]
-    of_naive: NotRequired[OfNaive]
 
 
-class Traffic(TypedDict):
-    """`mission.bytes_per_detection`."""
-
-    latent: Annotated[float, Metric("bytes in the map", "Size of one belief.", 0)]
-    features: Annotated[float, Metric("bytes of features", "Mean, of a detection.", 0)]
-    raw: Annotated[float, Metric("bytes of a scan", "Mean, of a detection.", 0)]
-
-
-TRAFFIC = "bytes_per_detection"
-Missions = dict[str, Case | Traffic]
-"""`mission`: a `Case` for each policy, and `bytes_per_detection`."""
+Missions = dict[str, Case]
+"""`mission`: the cases by name, policies and robots that fail."""
 
 
 class Learned(TypedDict):
@@ -262,12 +244,6 @@ class Origin(TypedDict):
     commit: NotRequired[Annotated[str, Metric("commit", "Commit of the source tree.")]]
 
 
-class Made(Origin):
-    """What made a stage of a run, or a part of it."""
-
-    stage: str
-
-
 class Evaluation(TypedDict):
     """Missions of `evaluate` in the same arenas: `RUN/evaluations/NAME.json`."""
 
@@ -284,7 +260,7 @@ class Header(Origin):
 
     preset: Annotated[str, Metric("preset", "Preset that the settings started from.")]
     seed: Annotated[int, Metric("seed", "Source of all randomness; the first of several seeds.")]
-    origins: NotRequired[Annotated[list[Made], Metric("origins", "Of the stages, if several.")]]
+    origins: NotRequired[Annotated[list[Origin], Metric("origins", "Of all, if they differ.")]]
     seeds: NotRequired[Annotated[dict[str, Results], Metric("seeds", "Results of each seed.")]]
     failed: NotRequired[Annotated[dict[str, str], Metric("failed", "Seeds that failed, and why.")]]
 
@@ -299,19 +275,9 @@ class Summary(Timed, Results):
     """The whole file."""
 
 
-def cases(missions: Missions) -> dict[str, Case]:
-    """The cases of a block `mission`, by name."""
-    return {name: cast(Case, case) for name, case in missions.items() if name != TRAFFIC}
-
-
-def policies(missions: Missions) -> dict[str, Case]:
-    """The cases of a block `mission` in which no robot fails, by policy."""
-    return {name: case for name, case in cases(missions).items() if not is_fault(name)}
-
-
-def traffic(missions: Missions) -> Traffic:
-    """The bytes of a detection in a block `mission`."""
-    return cast(Traffic, missions[TRAFFIC])
+def policies(missions: Missions) -> Missions:
+    """The cases in which no robot fails, by policy."""
+    return {name: case for name, case in missions.items() if not is_fault(name)}
 
 
 def _metrics(block: type, prefix: str = "") -> Iterator[Metric]:
@@ -339,7 +305,6 @@ BLOCKS = {
     "belief.": BELIEF,
     "dqn.MODALITY.": AGENTS,
     "mission.POLICY.": MISSIONS,
-    f"mission.{TRAFFIC}.": _table(Traffic),
     "evaluations.NAME.": _table(Evaluation),
 }
 """All metrics, by the prefix of their key in `summary.json` and then by the rest of it. Evaluations

@@ -9,12 +9,12 @@ from jaxtyping import PyTree
 
 from jaxsense.mission.outcome import is_fault
 from jaxsense.summary import blocks
-from jaxsense.summary.blocks import Case, Interval, Missions, Origin, Results, Summary, cases, mean
+from jaxsense.summary.blocks import Interval, Missions, Origin, Results, Summary, mean
 
 REFERENCE = "latent"
 """The policy that the others are compared with."""
 
-AS_ACCURATE = 0.005
+_AS_ACCURATE = 0.005
 """Difference of accuracies that does not matter when times and looks are compared."""
 
 Measured = Mapping[str, PyTree[np.ndarray]]
@@ -24,7 +24,6 @@ UNKNOWN: Origin = {"versions": {}, "devices": []}
 """Origin of figures that do not tell it."""
 
 _MADE_BY = ("devices", "cores", "source", "commit")
-_NAIVE = ("naive", "naive_2", "naive_3")
 _MOST_TIMES, _MOST_NATS = 1.2, 0.01  # NLL of a sound map, of that of exact Bayes
 _SMOKE = "Preset smoke only checks that everything runs: its policies are not meant to be good."
 _AS_FAST = 0.005  # share of a time that does not matter
@@ -55,45 +54,6 @@ def differences(found: Measured, reference: Measured) -> blocks.Differences:
         for name in ("observations_per_poi", "time_s")
     )
     return {"accuracy": interval(own - other), "observations_per_poi": looks, "time_s": seconds}
-
-
-def of_naive(played: dict[str, Case], name: str) -> blocks.OfNaive | None:
-    """Compares looks and time of a policy with naive exploration of the same accuracy.
-
-    Interpolates linearly between naive exploration with one, two and three looks of each robot at
-    each PoI, and ignores looks that make it no more accurate. Compares a policy that is more
-    accurate than all of these with the most accurate one: naive exploration would need even more.
-
-    Args:
-      played: cases in the same arenas.
-      name: of the policy.
-
-    Returns:
-      The ratios; None if naive exploration was not played, or is more accurate with fewer looks.
-    """
-    if not {name, *_NAIVE} <= set(played):
-        return None
-    naive = [played[_NAIVE[0]]]
-    for each in _NAIVE[1:]:
-        if played[each]["accuracy"] > naive[-1]["accuracy"]:
-            naive.append(played[each])
-    case, accuracies = played[name], [each["accuracy"] for each in naive]
-    if case["accuracy"] < accuracies[0]:
-        return None
-    return blocks.OfNaive(**{
-        key: float(case[key] / np.interp(case["accuracy"], accuracies, [n[key] for n in naive]))
-        for key in blocks.OfNaive.__annotations__
-    })  # fmt: skip
-
-
-def compared(missions: Missions) -> Missions:
-    """Recomputes the ratios `of_naive` of missions in the same arenas."""
-    found, played = missions.copy(), cases(missions)
-    for name, case in played.items():
-        ratios, kept = of_naive(played, name), case.copy()
-        kept.pop("of_naive", None)
-        found[name] = kept if ratios is None else {**kept, "of_naive": ratios}
-    return found
 
 
 def of_seeds(runs: Sequence[Summary]) -> tuple[blocks.Timing, dict[str, Results], Results]:
@@ -163,7 +123,7 @@ def differences_of(origins: Sequence[Origin]) -> dict[str, list[str]]:
 
 
 def several_origins(origins: Sequence[Origin]) -> str | None:
-    """Says in what the origins of a run's stages differ; None if they do not."""
+    """Says in what the origins of a run differ; None if they do not."""
     parts = [
         f"{name} {' and '.join(dict.fromkeys(values))}"
         for name, values in differences_of(origins).items()
@@ -179,17 +139,7 @@ def remarks(found: Summary) -> list[str]:
     return [each for each in (several_origins(found.get("origins", ())), caution) if each]
 
 
-def detection_sizes(block: Missions) -> str:
-    """Says how many bytes a detection takes, on average over those of some missions."""
-    size = blocks.traffic(block)
-    return (
-        f"A detection takes {mean(size['latent']):,.0f} bytes in the map; in these missions, on "
-        f"average {mean(size['features']):,.0f} as features and {mean(size['raw']):,.0f} as a raw "
-        "scan."
-    )
-
-
-def verdict(played: dict[str, Case]) -> str | None:
+def verdict(played: Missions) -> str | None:
     """Compares the latent policy with naive exploration, and its time with the fastest policy's.
 
     A sentence about median times and, if it differs, one about accuracy; None unless both policies
@@ -215,12 +165,12 @@ def verdict(played: dict[str, Case]) -> str | None:
         for name in played
         if not (is_fault(name) or name.startswith("naive"))
         and ratios[name] > 1 / (1 - _AS_FAST)
-        and accuracy[name] > accuracy[REFERENCE] - AS_ACCURATE
+        and accuracy[name] > accuracy[REFERENCE] - _AS_ACCURATE
     ]
     if faster:
         text += f" (and {against(max(faster, key=lambda name: ratios[name]))})"
     right, usual = accuracy[REFERENCE], accuracy["naive"]
-    if abs(right - usual) >= AS_ACCURATE:
+    if abs(right - usual) >= _AS_ACCURATE:
         text += f". It labels {100 * right:.1f}\u00a0% of the PoIs right, naive exploration "
         text += f"{100 * usual:.1f}\u00a0%"
     return f"{text}."

@@ -4,33 +4,32 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense.config import Config
 from jaxsense.mission.outcome import REASONS
-from jaxsense.mission.state import Mission
 from jaxsense.summary import blocks
-from jaxsense.summary.blocks import Case, Missions, cases
-from jaxsense.summary.compare import REFERENCE, Measured, compared, differences
+from jaxsense.summary.blocks import Case, Missions
+from jaxsense.summary.compare import REFERENCE, Measured, differences
 
 _UNAMBIGUOUS = 0.9  # share of looks that leave only the class; above, the class is unambiguous
 _AS_GOOD = 0.01  # tolerance of the reward below the optimum
 _ERROR = 0.01  # of the optimum, as a share of it
-_FLOAT_BYTES = 4
 
 _Rewards = Mapping[str, tuple[np.ndarray, np.ndarray]]
 
 
 def jmvae(measured: Mapping[str, object]) -> blocks.Jmvae:
     """The block `jmvae` from arrays under its keys, with shares of looks under `unambiguous`."""
-    block: blocks.Jmvae = jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+    block: blocks.Jmvae = plain(dict(measured))
     for name, shares in block["unambiguous"].items():
         block["unambiguous"][name] = [share > _UNAMBIGUOUS for share in shares]
     return block
 
 
-def beliefs(measured: Mapping[str, jax.Array]) -> blocks.Beliefs:
-    """The block `belief` from arrays under its keys."""
-    return jax.tree.map(lambda x: np.asarray(x).tolist(), dict(measured))
+def plain(measured: PyTree) -> PyTree:
+    """Arrays as lists and numbers."""
+    return jax.tree.map(lambda x: np.asarray(x).tolist(), measured)
 
 
 def agent(
@@ -101,14 +100,13 @@ def _returns(rewards: _Rewards, num_starts: int, has_optimum: bool) -> blocks.Re
     }
 
 
-def missions(mission: Mission, played: Mapping[str, Measured]) -> Missions:
+def missions(config: Config, played: Mapping[str, Measured]) -> Missions:
     """The block `mission`, from metrics of the missions of each case, in the same arenas."""
-    found: Missions = {name: case(mission.config, name, each) for name, each in played.items()}
-    for name, block in cases(found).items():
+    found: Missions = {name: case(config, name, each) for name, each in played.items()}
+    for name, block in found.items():
         if REFERENCE in played and name != REFERENCE:
             block["intervals"] = differences(played[name], played[REFERENCE])
-    detections = sum(each["detections"].sum(axis=0) for each in played.values())
-    return {**compared(found), "bytes_per_detection": traffic(mission, np.asarray(detections))}
+    return found
 
 
 def case(config: Config, name: str, found: Measured) -> Case:
@@ -159,21 +157,3 @@ def _calibration(found: Measured) -> blocks.Calibration:
 def _share(part: int, whole: int) -> float | None:
     """Share of a whole; None if that is 0."""
     return float(part / whole) if whole else None
-
-
-def traffic(mission: Mission, detections: np.ndarray) -> blocks.Traffic:
-    """Bytes of a belief, and of the features and the scan of a mean detection.
-
-    Args:
-      mission: all robots and their sensors.
-      detections: `[R]` number of each robot's detections; without any, robots count alike.
-    """
-    detections = np.maximum(detections, 0 if np.any(detections) else 1)
-    config = mission.config
-    scans = [mission.world.sensors[m].scan_bytes for m in config.modality_of_robot]
-    features = [_FLOAT_BYTES * len(config.labels(name)) for name in config.carried]
-    return {
-        "latent": float(2 * _FLOAT_BYTES * config.jmvae.latent_size),
-        "features": float(np.average(features, weights=detections)),
-        "raw": float(np.average(scans, weights=detections)),
-    }

@@ -9,11 +9,9 @@ from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, ge
 from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError
-from jaxsense.config.options import command
-from jaxsense.config.plain import parse_json
+from jaxsense.config.options import command, parse_json
 from jaxsense.core import inside
-from jaxsense.summary import blocks
-from jaxsense.summary.blocks import Evaluation, Interval, Made, Missions, Results, Summary, Timed
+from jaxsense.summary.blocks import Evaluation, Interval, Missions, Origin, Results, Summary, Timed
 
 ORIGINS = "origins.json"
 EVALUATIONS = "evaluations"
@@ -45,14 +43,14 @@ def read_evaluations(run: Path) -> dict[str, Evaluation]:
     return {file.stem: cast(Evaluation, _read(run, file, Evaluation)) for file in files}
 
 
-def read_made(run: Path) -> list[Made]:
-    """What made each stage of a run, which need not be finished; without `origins.json`, nothing.
+def read_origins(run: Path) -> list[Origin]:
+    """The processes that have worked on a run, in order; none without `origins.json`.
 
     Raises:
       ConfigError: if the file cannot be read, or a value in it is missing or wrong.
     """
     file = run / ORIGINS
-    return cast(list[Made], _read(run, file, list[Made])) if file.exists() else []
+    return cast(list[Origin], _read(run, file, list[Origin])) if file.exists() else []
 
 
 def _read(run: Path, file: Path, kind: type) -> object:
@@ -89,10 +87,9 @@ def _wrong(value: object, kind: type, key: str, is_mean: bool = False) -> str | 
         if missing := sorted(kind.__required_keys__ - set(value)):
             return f"{key}.{missing[0]} is missing"
         items = [(name, value[name], hints[name]) for name in hints if name in value]
-    elif kind == Missions and isinstance(value, dict) and 1 < len(value) <= _MOST_CASES:
-        kinds = {**dict.fromkeys(value, blocks.Case), blocks.TRAFFIC: blocks.Traffic}
-        items = [(name, value.get(name), each) for name, each in kinds.items()]
-    elif origin is dict and kind != Missions and isinstance(value, dict):
+    elif kind == Missions and not (isinstance(value, dict) and 0 < len(value) <= _MOST_CASES):
+        return f"{key} must hold 1 to {_MOST_CASES:,} cases"
+    elif origin is dict and isinstance(value, dict):
         items = [(name, each, inner[1]) for name, each in value.items()]
     elif origin is list and isinstance(value, list):
         items = [(str(i), each, inner[0]) for i, each in enumerate(value)]

@@ -1,9 +1,7 @@
 """Frozen tasks, their scores, and trained models that ship with the package."""
 
-from jaxsense.tasks.environment import Environment as Environment
-from jaxsense.tasks.environment import TimeStep as TimeStep
-from jaxsense.tasks.pretrained import PRETRAINED as PRETRAINED
-from jaxsense.tasks.pretrained import load_pretrained as load_pretrained
+from jaxsense.tasks.registry import PRETRAINED as PRETRAINED
+from jaxsense.tasks.registry import load_pretrained as load_pretrained
 from jaxsense.tasks.registry import make as make
 from jaxsense.tasks.registry import origin as origin
 from jaxsense.tasks.registry import registered as registered
@@ -14,4 +12,6 @@ from jaxsense.tasks.score import greedy as greedy
 from jaxsense.tasks.score import mean_return as mean_return
 from jaxsense.tasks.score import on_host as on_host
 from jaxsense.tasks.score import score as score
+from jaxsense.tasks.task import Environment as Environment
 from jaxsense.tasks.task import Task as Task
+from jaxsense.tasks.task import TimeStep as TimeStep

@@ -1,22 +1,33 @@
-"""The frozen tasks by name."""
+"""Files that travel with the package, by name: trained models, and frozen tasks."""
 
 import dataclasses
+import json
 from collections.abc import Iterable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jaxsense import models
-from jaxsense.config import Config, ConfigError
+from jaxsense.config import Config, ConfigError, from_plain
+from jaxsense.config.options import without_former
 from jaxsense.config.section import require_32_bits
-from jaxsense.core.types import Key
+from jaxsense.core.types import Key, placed
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
-from jaxsense.tasks.environment import Scaling
-from jaxsense.tasks.pretrained import DATA, PRETRAINED, Origin, fill, read
-from jaxsense.tasks.task import Task, fixed_draws, key_of_seed
+from jaxsense.tasks.task import Scaling, Task, fixed_draws, key_of_seed
 from jaxsense.training.comparison import models_of
+
+Arrays = dict[str, np.ndarray]
+
+DATA = Path(__file__).parent / "data"
+"""Where the files are."""
+PRETRAINED = ("default", "noisy", "many", "raw", "team")
+"""Presets with trained models, for `load_pretrained`."""
+PREFIX = "pretrained:"
+"""What stands before a preset's name where the directory of a run may stand, too."""
 
 TASKS = {
     "map-v0": "the paper's map of three PoIs, with detections that are almost always confident",
@@ -27,6 +38,32 @@ TASKS = {
 """The frozen tasks, and what is special in each."""
 
 
+# The others follow from the settings.
+PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks"
+
+
+@dataclasses.dataclass(frozen=True)
+class Origin:
+    """Origin of trained models: command, seed, commit and versions.
+
+    Attributes:
+      versions: of jaxsense, Python and the packages that results depend on.
+    """
+
+    command: str
+    preset: str
+    seed: int
+    commit: str
+    versions: dict[str, str]
+
+
+def load_pretrained(preset: str) -> tuple[Config, Models]:
+    """Loads the settings and the trained models of a preset, which ship with the package."""
+    require_32_bits()
+    arrays, config, _ = _read("preset", preset, PRETRAINED)
+    return config, models.make_models(config, **_trained(arrays, config, *PARTS))
+
+
 def registered() -> tuple[str, ...]:
     """Lists the names of all tasks that `make` accepts."""
     return tuple(TASKS)
@@ -34,14 +71,12 @@ def registered() -> tuple[str, ...]:
 
 def origin(name: str) -> Origin:
     """Returns the origin of a task, or of the models of `load_pretrained`."""
-    _require_name(name, (*PRETRAINED, *TASKS))
-    return read(DATA / f"{name}.npz")[2]
+    return _read("name", name, (*PRETRAINED, *TASKS))[2]
 
 
 def agents(name: str) -> tuple[str, ...]:
     """Lists the agents of a task that `make` accepts."""
-    _require_name(name)
-    return agents_of(read(DATA / f"{name}.npz")[1])
+    return agents_of(_read("name", name, TASKS)[1])
 
 
 def make(name: str, agent: str | None = None) -> Task:
@@ -59,19 +94,14 @@ def make(name: str, agent: str | None = None) -> Task:
     Raises:
       ConfigError: if there is no such task or agent, or if JAX computes in 64 bits.
     """
-    _require_name(name)
     require_32_bits()
-    arrays, config, _ = read(DATA / f"{name}.npz")
+    arrays, config, _ = _read("name", name, TASKS)
     acting = agents_of(config)
     agent = acting[0] if agent is None else agent
-    if agent not in acting:
-        raise ConfigError("agent", agent, f"must be one of {', '.join(acting)}")
-    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
-    fusion = fill(arrays, "fusion", shapes.fusion)
-    values = fill(arrays, "look_values", shapes.look_values)
+    _require_known("agent", agent, acting)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
-    parts = models_of(config, fusion, values)
+    parts = models_of(config, **_trained(arrays, config, "fusion", "look_values"))
     returns = jnp.asarray(arrays[f"returns/{agent}"])
     return task_of(name, agent, config, parts, looks, scaling, returns)
 
@@ -118,12 +148,6 @@ def reference_returns(task: Task, seeds: int, episodes: int) -> dict[str, np.nda
     return {name: mean(name) for name in task.references}
 
 
-def _require_name(name: str, known: Iterable[str] = TASKS) -> None:
-    """Raises `ConfigError` if there is no such task."""
-    if name not in tuple(known):  # a list has no hash
-        raise ConfigError("name", name, f"must be one of {', '.join(known)}")
-
-
 def agents_of(config: Config) -> tuple[str, ...]:
     """Who acts in a task with some settings."""
     return ("team",) if config.dqn.task == "team" else config.modalities
@@ -147,3 +171,29 @@ def task_of(
         teams = dataclasses.replace(mdp.teams, partly_seen=0.0, is_random=False)
         mdp = dataclasses.replace(mdp, robots=jnp.array(config.modality_of_robot), teams=teams)
     return Task(mdp, parts, scaling, returns, name, agent, config.modalities)
+
+
+def read(file: Path) -> tuple[Arrays, Config, Origin]:
+    """Arrays by their places in trees, settings and origin, from a file of `benchmarks.ship`."""
+    with np.load(file, allow_pickle=False) as found:
+        arrays = {name: found[name] for name in found.files}
+    about = json.loads(str(arrays.pop("about")))
+    return arrays, from_plain(without_former(about["config"])), Origin(**about["origin"])
+
+
+def _read(field: str, name: str, known: Iterable[str]) -> tuple[Arrays, Config, Origin]:
+    """The file of one of the known names; raises `ConfigError` for others."""
+    _require_known(field, name, known)
+    return read(DATA / f"{name}.npz")
+
+
+def _require_known(field: str, value: str, known: Iterable[str]) -> None:
+    if value not in tuple(known):  # a list has no hash
+        raise ConfigError(field, value, f"must be one of {', '.join(known)}")
+
+
+def _trained(arrays: Arrays, config: Config, *parts: str) -> dict[str, PyTree]:
+    """Parts of models by their names."""
+    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
+    found = placed({name: getattr(shapes, name) for name in parts}, arrays)
+    return jax.tree.map(jnp.asarray, found)

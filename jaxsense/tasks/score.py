@@ -4,6 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -154,10 +155,10 @@ def score(
     if not policies:
         raise ConfigError("policy", policy, "must be one policy or several")
     seeds = len(policies)
-    keys = [key_of_seed(seed) for seed in range(seeds)]
     players = {id(each): _player(each) for each in policies}
-    pairs = zip(keys, policies, strict=True)
-    returns = [players[id(each)](key, task, episodes) for key, each in pairs]
+    returns = [
+        players[id(each)](key_of_seed(seed), task, episodes) for seed, each in enumerate(policies)
+    ]
     if task.name in TASKS and episodes == EPISODES and seeds <= SEEDS:
         known = np.asarray(task.returns)[:, :seeds]
         references = dict(zip(task.references, known, strict=True))
@@ -255,14 +256,13 @@ def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
     else:
         require_function("policy", act, 2, _IS_POLICY)
         act = Partial(_forget, act)
-    play = _play_compiled
+    play = functools.partial(_play_compiled, act)
     if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
         # A program of its own, which goes when the policy does.
-        own = functools.partial(_play, act)
-        play, act = jax.jit(lambda _, *rest: own(*rest), static_argnums=4), ()
+        play = jax.jit(functools.partial(_play, act), static_argnums=3)
 
     def checked(key: Key, task: Task, episodes: int) -> float:
-        found = float(play(act, memory, key, task, episodes))
+        found = float(play(memory, key, task, episodes))
         if np.isnan(found):
             last = task.num_actions - 1
             raise ConfigError("policy", policy, f"must return actions from 0 to {last}")
@@ -294,23 +294,18 @@ def _choose(
     if not isinstance(found, tuple | list) or len(found) != 2:
         raise ValueError("policy: must return an action and a memory")
     action, after = found
-    if not isinstance(action, _NUMBERS):
-        raise ValueError(f"policy: must return an integer of shape []; not {type(action).__name__}")
-    action = jnp.asarray(action)
-    if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
+    form = type(action).__name__
+    if isinstance(action, _NUMBERS):
+        action = jnp.asarray(action)
         form = f"{action.dtype}{[*action.shape]}"
+    if not isinstance(action, jax.Array) or action.shape or action.dtype.kind not in "iu":
         raise ValueError(f"policy: must return an integer of shape []; not {form}")
-    if _form(after) != _form(memory):
-        raise ValueError(
-            "policy: must return a memory with the structure, shapes and dtypes of the first"
-        )
+    try:
+        chex.assert_trees_all_equal_shapes_and_dtypes(*jax.tree.map(jnp.asarray, (after, memory)))
+    except AssertionError as error:
+        form = "a memory with the structure, shapes and dtypes of the first"
+        raise ValueError(f"policy: must return {form}") from error
     return action.astype(jnp.int32), after
-
-
-def _form(tree: PyTree) -> tuple[object, object]:
-    """Structure, shapes and dtypes of a tree."""
-    leaves = [(jnp.shape(x), jnp.result_type(x)) for x in jax.tree.leaves(tree)]
-    return jax.tree.structure(tree), leaves
 
 
 def _forget(

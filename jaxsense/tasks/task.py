@@ -1,7 +1,8 @@
-"""Tasks that stay as they are, so that scores from different people can be compared.
+"""Tasks: the MDP of one policy as a few pure functions, and those that are frozen.
 
-A task is an MDP with frozen networks whose looks are drawn from stored detections. Its version is
-part of its name and changes with anything that changes a score.
+A frozen task has fixed networks, and its looks are drawn from stored detections, so that scores
+from different people can be compared. Its version is part of its name and changes with anything
+that changes a score.
 """
 
 import contextlib
@@ -11,17 +12,19 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense import dqn
+from jaxsense.config.section import require_32_bits
+from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import episodes, policies
+from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.episodes import Start
-from jaxsense.dqn.mdp import State
+from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.policies import Known
 from jaxsense.models import Models
-from jaxsense.tasks.environment import CLIP, Environment, Scaling
 
 M = TypeVar("M")
 
@@ -29,12 +32,118 @@ SEEDS = 10
 """Number of seeds of a score."""
 EPISODES = 1024
 """Number of episodes of a score with each seed."""
+CLIP = 10.0
+"""Scaled observations are within plus and minus this."""
 
 _FIRST_SEED = 2**31  # far from those that anybody trains with
 _IMPLEMENTATION = "threefry2x32"  # of random numbers, in all scores
 
 Act = Callable[[Key, M, jax.Array], tuple[jax.Array, M]]
 """`(key, memory, observation [S]) -> []` int32 action, and the memory after it."""
+
+
+@pytree
+class Scaling:
+    """Brings the numbers of an observation to about the same size, the same way for every PoI.
+
+    Attributes:
+      offset: `[F]` means over states that random looks lead to.
+      scale: `[F]` their standard deviations.
+    """
+
+    offset: jax.Array
+    scale: jax.Array
+
+    def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
+        """`[N * F]` scaled from `[N, F]`, PoI by PoI."""
+        scaled = (features - self.offset[None]) / self.scale[None]
+        return jnp.clip(scaled, -CLIP, CLIP).reshape(-1)
+
+    def inverse(self, observation: Float[Array, " S"]) -> Float[Array, "N F"]:
+        """`[N, F]` from `[N * F]` scaled, but for what was clipped."""
+        scaled = observation.reshape(-1, self.offset.size)
+        return scaled * self.scale[None] + self.offset[None]
+
+
+@pytree
+class TimeStep:
+    """Output of a step: observation, reward, and whether the episode has ended.
+
+    Attributes:
+      terminated: `[]` bool, the agent has ended the episode.
+      truncated: `[]` bool, the episode has reached its limit of steps.
+    """
+
+    observation: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+
+
+@pytree
+class Environment:
+    """An environment in which one policy makes all choices; a pytree.
+
+    Robots choose in turn, and each observation is what the robot knows whose turn it is.
+
+    Attributes:
+      bound: observations are within plus and minus this.
+    """
+
+    mdp: Mdp
+    bound = float("inf")
+
+    @property
+    def num_actions(self) -> int:
+        """A: a look at each PoI, and NOP, the last, which ends the robot's work."""
+        return self.mdp.num_actions
+
+    @property
+    def max_steps(self) -> int:
+        """Actions after which an episode is truncated."""
+        return int(self.mdp.config.max_steps)
+
+    @property
+    def observation_size(self) -> int:
+        """S, the features of all PoIs."""
+        return self.mdp.num_features * self.mdp.num_pois
+
+    def reset(self, key: Key) -> tuple[Float[Array, " S"], State]:
+        """Starts an episode: the observation, and the state."""
+        require_32_bits()
+        state = mdps.reset(key, self.mdp)
+        return self.observe(state), state
+
+    def observe(self, state: State) -> Float[Array, " S"]:
+        """What the robot sees that chooses."""
+        return self.seen_by(state.agent, state)
+
+    def seen_by(self, robot: Int[Array, ""], state: State) -> Float[Array, " S"]:
+        """What a robot sees of a state."""
+        times = self.mdp.times(state)
+        return self.scaled(self.mdp.features(state.belief, state.team, times, robot))
+
+    def scaled(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
+        """Features of all PoIs as an observation; here as they are."""
+        return features.reshape(-1)
+
+    def action_mask(self, state: State) -> Bool[Array, " A"]:
+        """The actions that exist in a state."""
+        return state.team.action_mask
+
+    def step(self, key: Key, state: State, action: Int[Array, ""]) -> tuple[State, TimeStep]:
+        """Takes an action; a PoI that is not present counts as NOP.
+
+        Returns:
+          The next state, and what the agent sees of it. The reward is that of the look, if there
+          was one, less the price of the time of all robots. An episode that has ended goes on.
+        """
+        checks.require_type("state", state, State, "as from reset")
+        checks.require_shape("action", action, ())
+        checks.require_index("action", action, self.num_actions)
+        after, outcome = mdps.step(key, self.mdp, state, state.team.existing(action))
+        seen, reward = self.observe(after), self.mdp.earned(outcome, after.team)
+        return after, TimeStep(seen, reward, outcome.terminated, outcome.truncated)
 
 
 @pytree
@@ -77,9 +186,9 @@ class Task(Environment):
             return "optimal", "greedy", "naive", "random"
         return "nearest", "auction", "rollout", "naive", "random"
 
-    def observe(self, state: State) -> Float[Array, " S"]:
-        """What the agent sees of a state: its features, scaled."""
-        return self.scaling(self.features(state))
+    def scaled(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
+        """See `Environment.scaled`."""
+        return self.scaling(features)
 
     def learning(self, agent: Agent) -> dqn.Environment:
         """What `dqn.train` learns in with `models.agent`, perhaps with other settings."""
@@ -105,7 +214,7 @@ class Task(Environment):
 
         def choose(key: Key, known: Known, memory: M) -> tuple[jax.Array, M]:
             seen = self.mdp.features(known.belief, known.team, known.times, known.robot)
-            action, memory = act(key, memory, self.scaling(seen))
+            action, memory = act(key, memory, self.scaled(seen))
             return known.team.existing(action), memory
 
         start, key = self._start(key)
@@ -114,20 +223,17 @@ class Task(Environment):
     def play_reference(self, key: Key, name: str) -> Float[Array, ""]:
         """The same with one of `references`; `name` is static."""
         exact, (start, key) = self.models.bayes, self._start(key)
+        optimal = None
         if name == "optimal":
             # The same in every episode, so that it is simulated once.
-            best = episodes.reference(_key(0), self.mdp, self.models, exact.labels)
-
-            def values(key: Key, known: Known) -> jax.Array:
-                del key
-                return best(known, start.state.classes)
-        else:
-
-            def values(key: Key, known: Known) -> jax.Array:
-                return {**policies.POLICIES, **policies.UNORDERED}[name](key, self.models, known)
+            optimal = episodes.reference(_key(0), self.mdp, self.models, exact.labels)
 
         def choose(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
-            of_present = jnp.where(known.team.action_mask, values(key, known), -jnp.inf)
+            if optimal is None:
+                values = {**policies.POLICIES, **policies.UNORDERED}[name](key, self.models, known)
+            else:
+                values = optimal(known, start.state.classes)
+            of_present = jnp.where(known.team.action_mask, values, -jnp.inf)
             return policies.best(of_present), memory
 
         return episodes.run_episode(key, self.mdp, exact, choose, start)[0]

@@ -1,42 +1,162 @@
-"""Stages that train the detectors, and what all later stages learn from.
+"""Stages that survey scenes, train the detectors, and detect what all later stages learn from.
 
-Those are detections, and how much of a repeated look is new.
+In a survey every robot looks at every PoI of a scene; all scenes are surveyed before any training.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense import looks
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import FitState
+from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.models import make_bayes, make_detector
 from jaxsense.sim import sensors
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
-from jaxsense.training.stage import Output, Stage, fit_stage
-from jaxsense.training.surveys import (
-    Scenes,
-    Surveys,
-    held_out_per_class,
-    num_scenes,
-    num_starts,
-    num_training,
-)
+from jaxsense.training.stage import Fit, Output, Stage, fit_stage
 from jaxsense.vae import detectors, novelty
 from jaxsense.vae.detectors import Classifier, Detector, Looks
 from jaxsense.vae.novelty import Novelty
 
+T = TypeVar("T")
+
+_SHARE_OF_EMPTY = 8  # one empty scene for so many to train detectors with; rays take time
 _NUM_CHECKS = 8192  # the most looks of each kind that set a threshold
 _SPOILT_EACH = 512  # windows of each kind that are spoilt by hand
 _REPEATS = 4  # looks in a scene
 _ELSEWHERE = 0.5, 2.0  # of the distance, outside of which a PoI is not where it is expected
+
+
+@pytree
+class Survey:
+    """Looks by every robot at every PoI of S scenes.
+
+    Attributes:
+      classes: `[S, N]` int32 true classes.
+      scenes: `[S]` scenes.
+      windows: for each modality `[S, N, F]` inputs of its detector.
+      distances: `[S, M, N]` expected distances of the PoIs, in metres.
+    """
+
+    classes: Int[Array, "S N"]
+    scenes: Scene
+    windows: tuple[Float[Array, "S N F"], ...]
+    distances: Float[Array, "S M N"]
+
+    def looks(self, modality: int) -> Looks:
+        """All looks by one modality, scene after scene."""
+        windows = self.windows[modality]
+        # XLA would fold the reshape into sums over the looks, which then round otherwise.
+        flat = jax.lax.optimization_barrier(windows.reshape(-1, windows.shape[-1]))
+        return Looks(flat, self.distances[:, modality].reshape(-1))
+
+    def of_scenes(self, part: slice) -> "Survey":
+        """The survey of some of the scenes; `part` is static."""
+        return jax.tree.map(lambda x: x[part], self)
+
+
+@pytree
+class Surveys:
+    """Surveys of all scenes, by what they are for.
+
+    Attributes:
+      training: to train detectors with.
+      bank: to learn from what trained detectors say.
+      held_out: to measure on.
+      empty: whose PoIs no look shows.
+    """
+
+    training: Survey
+    bank: Survey
+    held_out: Survey
+    empty: Survey
+
+
+def num_scenes(config: Config) -> tuple[int, int, int, int]:
+    """Numbers of scenes to train detectors with, for the bank, to measure on, and empty ones."""
+    together, num_pois = config.jmvae.num_together, config.arena.num_pois
+    num_train = -(-config.detector.num_scans // num_pois)
+    num_bank, num_held_out = (
+        -(-each * len(config.arena.classes) // num_pois)
+        for each in (config.jmvae.samples_per_class, held_out_per_class(config))
+    )
+    parts = num_train, max(num_bank, num_starts(config) * together), num_held_out
+    # Whole groups of scenes that show the same PoIs.
+    training, bank, held_out = (-(-number // together) * together for number in parts)
+    return training, bank, held_out, -(-num_train // _SHARE_OF_EMPTY)
+
+
+def held_out_per_class(config: Config) -> int:
+    """Number of held-out looks at each class."""
+    return -(-config.detector.num_held_out // len(config.arena.classes))
+
+
+def num_training(config: Config) -> int:
+    """Looks by each sensor to train its detector with, in whole groups; the others calibrate it."""
+    together, num_pois = config.jmvae.num_together, config.arena.num_pois
+    group = 1 if together == 1 else together * num_pois
+    return group * config.detector.num_training(num_scenes(config)[0] * num_pois // group)
+
+
+def num_starts(config: Config) -> int:
+    """Number of surveyed scenes in which episodes start; 0 unless looks are live."""
+    return config.dqn.num_starts if config.dqn.observe == "live" else 0
+
+
+Scenes = tuple[Key, Int[Array, "S N"], Bool[Array, " S"], Key | None]
+"""Keys, classes, which are empty, and keys of the PoIs' places, see `draw_scenes`."""
+
+
+def draw_scenes(key: Key, config: Config) -> Scenes:
+    """Draws keys and classes of all scenes.
+
+    Returns:
+      `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, `[S]` bool, in which scenes
+      no look shows its PoI, and `[S]` keys of the PoIs' places, of which four in a row are
+      the same if the JMVAE learns from groups of looks; otherwise None.
+    """
+    class_key, scene_key = jax.random.split(key)
+    numbers = num_scenes(config)
+    keys = jax.random.split(class_key, len(numbers))
+    total, each = sum(numbers), config.jmvae.num_together
+    parts = [
+        looks.balanced_classes(k, config, -(-n // each)) for k, n in zip(keys, numbers, strict=True)
+    ]
+    classes = jnp.repeat(jnp.concatenate(parts), each, axis=0)[:total]
+    is_empty = jnp.arange(total) >= sum(numbers[:3])
+    places = None
+    if each > 1:
+        scene_key, place_key = jax.random.split(scene_key)
+        place_keys = jax.random.split(place_key, -(-total // each))
+        places = jnp.repeat(place_keys, each)[:total]
+    return jax.random.split(scene_key, total), classes, is_empty, places
+
+
+def survey(key: Key, config: Config, *, arena: Arena, scenes: Scenes) -> Survey:
+    """Surveys all scenes together: compiling takes longer than running.
+
+    It may get a part of the scenes, and knows nothing of their number.
+    """
+    del key
+    keys, classes, is_empty, places = scenes
+    world = make_world(config, arena=arena)
+    seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
+    return Survey(classes, seen, windows, distances)
+
+
+def divide(config: Config, survey: Survey, **_: Scenes) -> Surveys:
+    """Divides the survey of all scenes by what it is for."""
+    ends = itertools.accumulate(num_scenes(config), initial=0)
+    return Surveys(*(survey.of_scenes(slice(*part)) for part in itertools.pairwise(ends)))
 
 
 @pytree
@@ -90,13 +210,12 @@ def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Loo
     Empty ones, and looks at PoIs that are spoilt by hand: most of their readings are lost, all are
     equal, or the PoI is expected at another distance.
     """
-    *_, num_empty = num_scenes(config)
     limits = config.viewpoint
 
     def of_modality(key: Key, m: int, sensor: Sensor) -> Looks:
         keys = jax.random.split(key, 5)
         lost_key, share_key, level_key, distance_key, order_key = keys
-        shown = jax.tree.map(lambda x: x[:_SPOILT_EACH], surveys.training.looks(m))
+        shown, _ = _divided(surveys.training.looks(m), _SPOILT_EACH)
         windows, distances = shown.windows, shown.distances
         number = windows.shape[:1]
         blind = jnp.minimum(sensor.blind, sensor.window_limit)
@@ -110,7 +229,7 @@ def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Loo
         ratio = expected / distances
         is_elsewhere = (ratio < _ELSEWHERE[0]) | (ratio > _ELSEWHERE[1])
         parts = [
-            surveys.others.of_scenes(slice(-num_empty, None)).looks(m),
+            surveys.empty.looks(m),
             Looks(jnp.where(lost, blind, windows), distances),
             Looks(jnp.broadcast_to(levels, windows.shape), distances),
             # Where it is expected about right, an empty window instead.
@@ -139,63 +258,38 @@ def detector_stage(
     number, reads_scans = num_training(config), config.jmvae.reads_scans
     of_class = config.label_of_class(config.modalities[modality])
 
-    def labelled(surveys: Surveys) -> tuple[Looks, Int[Array, " S"]]:
-        """Looks at PoIs, and their labels."""
+    def fit(
+        config: Config, *, surveys: Surveys, examples: tuple[Looks, ...], **given: Output
+    ) -> Fit:
         classes = surveys.training.classes.reshape(-1)
         labels = jnp.zeros_like(classes) if reads_scans else jnp.array(of_class)[classes]
-        return surveys.training.looks(modality), labels
+        to_train, held_out = _divided((surveys.training.looks(modality), labels), number)
+        nothing = examples[modality]
+        few_of_nothing, nothing = _divided(nothing, min(len(nothing.distances) // 4, _NUM_CHECKS))
 
-    def untrained(
-        key: Key, config: Config, *, surveys: Surveys, **_: Output
-    ) -> tuple[Classifier, Params]:
-        windows = surveys.training.looks(modality).windows[:number]
-        detector = make_detector(key, config, modality, windows)
-        return detector, detector.params
+        def untrained(key: Key) -> tuple[Classifier, Params]:
+            detector = make_detector(key, config, modality, to_train[0].windows)
+            return detector, detector.params
 
-    def problem(
-        config: Config,
-        detector: Classifier,
-        *,
-        surveys: Surveys,
-        examples: tuple[Looks, ...],
-        **_: Output,
-    ) -> detectors.Fitting:
-        shown, labels = jax.tree.map(lambda x: x[:number], labelled(surveys))
-        nothing = _divided(examples[modality])[1]
-        return detectors.Fitting(config.detector, detector, shown, labels, nothing)
+        def problem(detector: Classifier) -> Problem[Output]:
+            return detectors.problem(config.detector, detector, *to_train, nothing)
 
-    def trained(
-        config: Config,
-        detector: Classifier,
-        fit: FitState,
-        *,
-        surveys: Surveys,
-        examples: tuple[Looks, ...],
-        **given: Output,
-    ) -> Detector:
-        found = dataclasses.replace(detector, params=fit.params)
-        others, labels = jax.tree.map(lambda x: x[number:], labelled(surveys))
-        if len(labels) and not reads_scans:
-            found = detectors.calibrate(found, others, labels)
-        bank = surveys.others.of_scenes(slice(num_scenes(config)[1])).looks(modality)
-        shown = jax.tree.map(lambda x: x[:_NUM_CHECKS], bank)
-        found = detectors.fitted(found, shown, _divided(examples[modality])[0])
-        return finish(config, found, surveys=surveys, **given)
+        def trained(detector: Classifier, fit: FitState) -> Detector:
+            found = dataclasses.replace(detector, params=fit.params)
+            if len(held_out[1]) and not reads_scans:
+                found = detectors.calibrate(found, *held_out)
+            checks, _ = _divided(surveys.bank.looks(modality), _NUM_CHECKS)
+            found = detectors.fitted(found, checks, few_of_nothing)
+            return finish(config, found, surveys=surveys, **given)
 
-    return fit_stage(
-        f"detector_{config.modalities[modality]}",
-        config.detector,
-        untrained=untrained,
-        problem=problem,
-        trained=trained,
-    )
+        return Fit(untrained, problem, trained)
+
+    return fit_stage(f"detector_{config.modalities[modality]}", config.detector, fit)
 
 
-def _divided(nothing: Looks) -> tuple[Looks, Looks]:
-    """Looks at nothing that set the threshold, and those that train the detector."""
-    number = min(len(nothing.distances) // 4, _NUM_CHECKS)
-    first, rest = slice(number), slice(number, None)
-    return jax.tree.map(lambda x: x[first], nothing), jax.tree.map(lambda x: x[rest], nothing)
+def _divided(rows: T, number: int) -> tuple[T, T]:
+    """The first rows, and the rest."""
+    return jax.tree.map(lambda x: x[:number], rows), jax.tree.map(lambda x: x[number:], rows)
 
 
 def detect(
@@ -211,28 +305,25 @@ def detect(
     Looks for training are sorted by their true classes, or by those that all looks at a PoI show.
     """
     del key
-    _, num_bank, _, num_empty = num_scenes(config)
-    others = surveys.others.of_scenes(slice(-num_empty))
-    features = looks.features(trained, others.windows, others.distances)
+    bank, held_out = surveys.bank, surveys.held_out
 
-    def by_class(
-        values: tuple[jax.Array, ...], part: slice, classes: jax.Array, number: int
-    ) -> Samples:
+    def features(survey: Survey) -> tuple[jax.Array, ...]:
+        return looks.features(trained, survey.windows, survey.distances)
+
+    def by_class(values: tuple[jax.Array, ...], classes: jax.Array, number: int) -> Samples:
         num_classes = len(config.arena.classes)
-        return tuple(looks.by_class(x[part], classes, num_classes, number) for x in values)
+        return tuple(looks.by_class(x, classes, num_classes, number) for x in values)
 
-    for_bank, for_measuring = slice(None, num_bank), slice(num_bank, None)
-    of_bank = others.classes[for_bank] if shown is None else shown.bank
-    of_measuring = others.classes[for_measuring]
-    starts = Starts(others.classes, others.scenes, features)
+    of_bank, classes = features(bank), bank.classes if shown is None else shown.bank
+    starts = Starts(bank.classes, bank.scenes, of_bank)
     # One scene of each group: no two starts show the same PoIs.
     together = config.jmvae.num_together
     rows = slice(0, num_starts(config) * together, together)
     return Detections(
-        bank=by_class(features, for_bank, of_bank, config.jmvae.samples_per_class),
-        held_out=by_class(features, for_measuring, of_measuring, held_out_per_class(config)),
+        bank=by_class(of_bank, classes, config.jmvae.samples_per_class),
+        held_out=by_class(features(held_out), held_out.classes, held_out_per_class(config)),
         starts=jax.tree.map(lambda x: x[rows], starts),
-        windows=by_class(others.windows, for_measuring, of_measuring, 1),
+        windows=by_class(held_out.windows, held_out.classes, 1),
     )
 
 
@@ -242,7 +333,7 @@ def learn_novelty(
     *,
     arena: Arena,
     trained: tuple[Detector, ...],
-    scenes: Scenes | None = None,
+    scenes: Scenes,
     shown: Shown | None = None,
 ) -> Novelty:
     """Learns how much of a look is new, see `vae.Novelty`; without repeated looks, all of it."""
@@ -267,7 +358,7 @@ def learn_novelty(
 
 
 def repeated(
-    key: Key, config: Config, scenes: Scenes | None, shown: Shown | None
+    key: Key, config: Config, scenes: Scenes, shown: Shown | None
 ) -> tuple[Int[Array, "S N"], Key | None, Int[Array, " S"]]:
     """Scenes at whose first PoIs each sensor looks again and again.
 
@@ -278,7 +369,7 @@ def repeated(
       PoIs are taken for.
     """
     number = config.detector.num_repeats
-    if scenes is None or shown is None:
+    if shown is None:
         shape = number, config.arena.num_pois
         classes = jax.random.randint(key, shape, 0, len(config.arena.classes))
         return classes, None, classes[:, 0]

@@ -1,6 +1,7 @@
 """The best of several JMVAEs, class beliefs, and the fusion."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,18 @@ from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.training import measures
 from jaxsense.training.detections import Detections
-from jaxsense.training.stage import Stage, fit_stage
+from jaxsense.training.stage import Fit, Stage, Start, fit_stage
 from jaxsense.vae import fusion, jmvae
-from jaxsense.vae.fusion import Decoding, Filter, Filtering, InPlace
+from jaxsense.vae.fusion import Filter, InPlace
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
+
+
+def start(config: Config, *, detections: Detections) -> Start:
+    """The fit of a JMVAE to detections."""
+    model = make_jmvae(config)
+    problem = jmvae.problem(config.jmvae, detections.bank, model)
+    return functools.partial(jmvae.init, model=model), problem
 
 
 def best(
@@ -65,7 +73,7 @@ def fit_in_place(
 ) -> InPlace:
     """Fusion in place, with decoders that have learned to decode beliefs."""
     settings = dataclasses.replace(config.jmvae, steps=-(-config.jmvae.steps // 3))
-    problem = Decoding(settings, detections.bank, make_jmvae(config), params)
+    problem = fusion.decoding(settings, detections.bank, make_jmvae(config), params)
     start = supervised.start(params["decoders"], settings)
     fit, _ = supervised.fit(key, start, problem, settings.steps)
     return make_in_place(config, {**params, "decoders": fit.params}, classes)
@@ -74,25 +82,15 @@ def fit_in_place(
 def filter_stage(config: Config) -> Stage:
     """Makes the stage that trains a filter on histories of looks."""
 
-    def untrained(
-        key: Key, config: Config, *, classes: Belief, detections: Detections
-    ) -> tuple[Filter, Params]:
-        del detections
-        found = fusion.init_filter(key, make_jmvae(config), classes, make_prior(config))
-        return found, found.networks
+    def fit(config: Config, *, classes: Belief, detections: Detections) -> Fit:
+        def untrained(key: Key) -> tuple[Filter, Params]:
+            found = fusion.init_filter(key, make_jmvae(config), classes, make_prior(config))
+            return found, found.networks
 
-    def problem(
-        config: Config, fitted: Filter, *, classes: Belief, detections: Detections
-    ) -> Filtering:
-        del classes
-        return Filtering(config.filter, fitted, detections.bank)
+        return Fit(
+            untrained,
+            lambda found: fusion.filtering(config.filter, found, detections.bank),
+            lambda found, fit: dataclasses.replace(found, networks=fit.params),
+        )
 
-    return fit_stage(
-        "filter",
-        config.filter,
-        untrained=untrained,
-        problem=problem,
-        trained=lambda config, fitted, fit, **inputs: dataclasses.replace(
-            fitted, networks=fit.params
-        ),
-    )
+    return fit_stage("filter", config.filter, fit)

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import chex
 import jax
@@ -10,13 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config
-from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call, pytree
+from jaxsense.core.types import Belief, Fusion, Key, Reliability, Samples, call
 from jaxsense.models import make_bayes
 from jaxsense.training.detections import Detections
 from jaxsense.vae import gaussian, readout
 
 _BINS = 15
 _LOOKS = 6  # in a history of looks at one PoI
+_HISTORIES = 1024  # to measure what a readout loses
 _HISTORIES_AT_ONCE = 512
 _ACTIVE_VARIANCE = 0.01
 
@@ -86,43 +88,19 @@ def diagram(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Rel
     return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])
 
 
-@pytree
-class LatentSpace:
-    """Metrics of a latent space, from held-out looks.
-
-    Attributes:
-      active_units: `[]` int32 number of latent dimensions in use.
-      sigma_norm: for `joint` and each modality `[C]` mean `||sigma||_2`.
-      unambiguous: for `joint` and each modality `[C]` share of looks after which only the true
-        class is plausible.
-      consistent: for `joint` and each modality `[C]` share of looks after which exactly the classes
-        are plausible that the sensor cannot distinguish from the true one.
-      moment_matching_error: `[]` mean of `moment_matching_error`.
-      readout_error: `[]` nats lost between writing a belief and reading it, see
-        `readout_error`.
-      fusion: `accuracy`, `mean_error` and `std_error` of beliefs after a look by one modality and
-        then by another, `[]` each; None with a single modality.
-    """
-
-    active_units: Int[Array, ""]
-    sigma_norm: dict[str, Float[Array, " C"]]
-    unambiguous: dict[str, Float[Array, " C"]]
-    consistent: dict[str, Float[Array, " C"]]
-    moment_matching_error: Float[Array, ""]
-    readout_error: Float[Array, ""]
-    fusion: dict[str, Float[Array, ""] | None]
-
-
 def latent_space(
     key: Key, config: Config, *, fusion: Fusion, detections: Detections
-) -> tuple[dict[str, Belief], LatentSpace]:
+) -> tuple[dict[str, Belief], dict[str, Any]]:
     """Fuses held-out looks, alone and together, and measures the latent space.
 
     The s-th look at a class by one modality is paired with the s-th by another. Non-finite
     parameters and features raise no error: check the beliefs.
 
     Returns:
-      `[C, S, D]` beliefs for `joint` and for each modality alone, and the metrics.
+      `[C, S, D]` beliefs for `joint` and for each modality alone, and metrics of them: `[C]` means
+      of `sigma_norm`, and `[C]` shares of looks after which only the true class is plausible
+      (`unambiguous`), or just those that the sensor cannot distinguish from it (`consistent`);
+      the others are `[]`.
     """
     bank, class_means = detections.held_out, fusion.classes.mean
     joint = _beliefs(fusion, bank, range(len(bank)))
@@ -141,15 +119,16 @@ def latent_space(
     ) -> Float[Array, " C"]:
         return jnp.all(is_open == expected[:, None], axis=-1).mean(axis=1)
 
-    return found, LatentSpace(
-        active_units=active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
-        sigma_norm={n: readout.sigma_norm(b.std).mean(axis=1) for n, b in found.items()},
-        unambiguous={n: share(x, same) for n, x in open_classes.items()},
-        consistent={n: share(x, consistent[n]) for n, x in open_classes.items()},
-        moment_matching_error=_mean_error(joint, alone, config),
-        readout_error=readout_error(key, config, bank, fusion.classes, fusion.class_probabilities),
-        fusion=_fusion_metrics(fusion, bank, alone),
-    )
+    read = fusion.class_probabilities
+    return found, {
+        "active_units": active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
+        "sigma_norm": {n: readout.sigma_norm(b.std).mean(axis=1) for n, b in found.items()},
+        "unambiguous": {n: share(x, same) for n, x in open_classes.items()},
+        "consistent": {n: share(x, consistent[n]) for n, x in open_classes.items()},
+        "moment_matching_error": _mean_error(joint, alone, config),
+        "readout_error": readout_error(key, config, bank, fusion.classes, read),
+        "fusion": _fusion_metrics(fusion, bank, alone),
+    }
 
 
 def _beliefs(fusion: Fusion, bank: Samples, members: Iterable[int]) -> Belief:
@@ -295,7 +274,6 @@ def readout_error(
     bank: Samples,
     classes: Belief,
     read: Callable[[Belief], Float[Array, " C"]],
-    number: int = 1024,
 ) -> Float[Array, ""]:
     """Nats that class probabilities lose when a belief holds them.
 
@@ -307,7 +285,6 @@ def readout_error(
       bank: looks at every class.
       classes: `[C, D]` mean joint posterior of each class.
       read: class probabilities of a belief.
-      number: of histories; static.
     """
     exact = make_bayes(config)
 
@@ -321,6 +298,6 @@ def readout_error(
 
         return jax.lax.scan(look, exact.prior, draw_history(key, bank, true_class))[1]
 
-    truth = jnp.arange(number) % len(classes.mean)
-    lost = jax.vmap(history)(jax.random.split(key, number), truth)
+    truth = jnp.arange(_HISTORIES) % len(classes.mean)
+    lost = jax.vmap(history)(jax.random.split(key, _HISTORIES), truth)
     return jnp.max(jnp.mean(lost, axis=0))

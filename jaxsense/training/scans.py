@@ -5,6 +5,8 @@ posteriors are the classes. The labels of the training scenes only name them: ea
 cluster that holds most of its PoIs. From then on, what all looks at a PoI show is its class.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,9 +16,8 @@ from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_encoder, make_frame, make_scan_jmvae
 from jaxsense.sim import sensors
-from jaxsense.training.detections import Shown, detector_stage
-from jaxsense.training.stage import Stage
-from jaxsense.training.surveys import Survey, Surveys, num_scenes, num_training
+from jaxsense.training.detections import Shown, Survey, Surveys, detector_stage, num_training
+from jaxsense.training.stage import Stage, Start
 from jaxsense.vae import frames, leave_one_out
 from jaxsense.vae.detectors import Classifier
 from jaxsense.vae.frames import Scaling
@@ -51,6 +52,13 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
         found.append(seen.reshape(*groups.shape[:2], -1))
         scalings.append(scaling)
     return Views(tuple(found), tuple(scalings))
+
+
+def start(config: Config, *, views: Views) -> Start:
+    """The fit of a JMVAE to views."""
+    model = make_scan_jmvae(config)
+    problem = leave_one_out.problem(config.jmvae, views.groups, model)
+    return functools.partial(leave_one_out.init, model=model), problem
 
 
 def _num_scenes(config: Config) -> int:
@@ -116,19 +124,16 @@ def shown(
 ) -> Shown:
     """What all looks at PoIs show together, which takes the place of labels."""
     del key
-    num_train, num_bank, _, _ = num_scenes(config)
 
-    def of_scenes(survey: Survey, part: slice) -> jax.Array:
-        if part.start == part.stop:
-            return jnp.zeros((0, config.arena.num_pois), jnp.int32)
-        of_groups = _shown(config, params, views, classes, survey, part)
+    def of_scenes(survey: Survey) -> jax.Array:
+        if not len(survey.classes):
+            return survey.classes
+        of_groups = _shown(config, params, views, classes, survey)
         of_groups = of_groups.reshape(-1, config.arena.num_pois)
         return jnp.repeat(of_groups, config.jmvae.num_together, axis=0)
 
-    calibrating = slice(_num_scenes(config), num_train)
-    return Shown(
-        of_scenes(surveys.training, calibrating), of_scenes(surveys.others, slice(0, num_bank))
-    )
+    calibrating = surveys.training.of_scenes(slice(_num_scenes(config), None))
+    return Shown(of_scenes(calibrating), of_scenes(surveys.bank))
 
 
 def _shown(
@@ -137,12 +142,11 @@ def _shown(
     views: Views,
     classes: Belief,
     survey: Survey,
-    part: slice,
     first: int | None = None,
 ) -> jax.Array:
     """`[P]` int32 classes that the first looks by each sensor, or all, show together."""
     groups = tuple(
-        jax.lax.map(jax.vmap(scaling), grouped(x[part], config)[:, :first], batch_size=512)
+        jax.lax.map(jax.vmap(scaling), grouped(x, config)[:, :first], batch_size=512)
         for scaling, x in zip(views.scalings, survey.windows, strict=True)
     )
     return leave_one_out.nearest(_posteriors(params, config, groups).mean, classes.mean)
@@ -157,12 +161,10 @@ def accuracies(
       `pair` after one look by each sensor, and `all_looks` after four by each.
     """
     del key
-    _, num_bank, num_held_out, _ = num_scenes(config)
-    part = slice(num_bank, num_bank + num_held_out)
-    truth = surveys.others.classes[part][:: config.jmvae.num_together].reshape(-1)
+    truth = surveys.held_out.classes[:: config.jmvae.num_together].reshape(-1)
 
     def share(first: int | None) -> jax.Array:
-        shown = _shown(config, params, views, classes, surveys.others, part, first)
+        shown = _shown(config, params, views, classes, surveys.held_out, first)
         return jnp.mean(shown == truth)
 
     return {"pair": share(1), "all_looks": share(None)}

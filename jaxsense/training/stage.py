@@ -3,6 +3,7 @@
 import dataclasses
 import zlib
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,6 @@ from jaxsense.core import supervised
 from jaxsense.core.networks import Params
 from jaxsense.core.supervised import FitConfig, FitState, Problem
 from jaxsense.core.types import Key, pytree
-from jaxsense.vae import jmvae, leave_one_out
 
 _MAX_CHUNKS = 20
 
@@ -93,56 +93,67 @@ def scan(
     return stage.finish(config, state, **inputs), progress
 
 
-_Fit = tuple[Output, FitState]
-"""An untrained model, and the state of its fit."""
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How a network is fitted.
+
+    Attributes:
+      untrained: `key -> (model, parameters to fit)`.
+      problem: `model -> Problem`.
+      trained: `(model, FitState) -> output`.
+    """
+
+    untrained: Callable[[Key], tuple[Output, Params]]
+    problem: Callable[[Any], Problem[Any]]
+    trained: Callable[[Any, FitState], Output]
 
 
-def fit_stage(
-    name: str,
-    settings: FitConfig,
-    *,
-    untrained: Callable[..., tuple[Output, Params]],
-    problem: Callable[..., Problem[Output]],
-    trained: Callable[..., Output],
-) -> Stage:
+def fit_stage(name: str, settings: FitConfig, fit: Callable[..., Fit]) -> Stage:
     """Makes a stage that fits a network.
 
     Args:
       name: of the stage.
       settings: only the number of steps matters.
-      untrained: `(key, config, **inputs) -> (model, parameters to fit)`.
-      problem: `(config, model, **inputs) -> Problem`.
-      trained: `(config, model, FitState, **inputs) -> output`.
+      fit: `(config, **inputs) -> Fit`.
     """
     size, chunks = in_chunks(settings.steps)
 
-    def begin(key: Key, config: Config, **inputs: Output) -> _Fit:
-        model, params = untrained(key, config, **inputs)
+    def begin(key: Key, config: Config, **inputs: Output) -> tuple[Output, FitState]:
+        model, params = fit(config, **inputs).untrained(key)
         return model, supervised.start(params, settings)
 
-    def advance(key: Key, config: Config, state: _Fit, **inputs: Output) -> tuple[_Fit, Progress]:
-        model, fit = state
-        fit, losses = supervised.fit(key, fit, problem(config, model, **inputs), size)
-        return (model, fit), Progress(losses, {})
+    def advance(
+        key: Key, config: Config, state: tuple[Output, FitState], **inputs: Output
+    ) -> tuple[tuple[Output, FitState], Progress]:
+        model, before = state
+        problem = fit(config, **inputs).problem(model)
+        after, losses = supervised.fit(key, before, problem, size)
+        return (model, after), Progress(losses, {})
 
-    def finish(config: Config, state: _Fit, **inputs: Output) -> Output:
-        return trained(config, *state, **inputs)
+    def finish(config: Config, state: tuple[Output, FitState], **inputs: Output) -> Output:
+        return fit(config, **inputs).trained(*state)
 
     return Stage(name, begin, advance, finish, settings.steps, chunks)
 
 
-def restarts(
-    config: Config, problem: Callable[..., jmvae.Fitting | leave_one_out.Fitting]
-) -> list[Stage]:
-    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk."""
+Start = tuple[Callable[[Key], Params], Problem[Any]]
+"""What draws parameters to start from, and the problem that they are fitted to."""
+
+
+def restarts(config: Config, start: Callable[..., Start]) -> list[Stage]:
+    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk.
+
+    Args:
+      start: `(config, **inputs) -> Start`.
+    """
+
+    def fit(config: Config, **inputs: Output) -> Fit:
+        init, problem = start(config, **inputs)
+        trained = lambda _, fit: (fit.params, fit.loss)  # noqa: E731
+        return Fit(lambda key: ((), init(key)), lambda _: problem, trained)
+
     number = config.jmvae.restarts
-    stage = fit_stage(
-        "",
-        config.jmvae,
-        untrained=lambda key, config, **inputs: ((), problem(config, **inputs).init(key)),
-        problem=lambda config, _, **inputs: problem(config, **inputs),
-        trained=lambda config, _, fit, **inputs: (fit.params, fit.loss),
-    )
+    stage = fit_stage("", config.jmvae, fit)
     stage = dataclasses.replace(stage, shares="jmvae", is_optional=number > 1)
     return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(number)]
 

@@ -14,12 +14,10 @@ from jaxtyping import Array, Bool
 from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.models import Models, make_jmvae, make_models, make_scan_jmvae
+from jaxsense.models import Models, make_models
 from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
-from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans, surveys
-from jaxsense.training.detections import Detections
-from jaxsense.training.scans import Views
+from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans
 from jaxsense.training.stage import (
     Drive,
     Output,
@@ -30,7 +28,6 @@ from jaxsense.training.stage import (
     restarts,
     scan,
 )
-from jaxsense.vae import jmvae, leave_one_out
 
 
 @pytree
@@ -56,14 +53,15 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
       config: all settings; its static fields determine the stages and all sizes.
       arena: from `sim.make_world(config)`.
     """
-    scenes = drive(Stage("scenes", surveys.draw_scenes))
-    survey = functools.partial(surveys.survey, arena=arena)
-    surveyed = drive(Stage("survey", survey, finish=surveys.divide), scenes=scenes)
+    scenes = drive(Stage("scenes", detections.draw_scenes))
+    survey = functools.partial(detections.survey, arena=arena)
+    surveyed = drive(Stage("survey", survey, finish=detections.divide), scenes=scenes)
     examples = drive(Stage("examples", detections.looks_at_nothing), surveys=surveyed)
     perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
-    detectors, params, classes, detected = perceive(
-        drive, config, arena, scenes=scenes, surveys=surveyed, examples=examples
-    )
+    learned = perceive(drive, config, surveys=surveyed, examples=examples)
+    detectors, params, classes, detected, shown = learned
+    novelty = Stage("novelty", functools.partial(detections.learn_novelty, arena=arena))
+    drive(novelty, trained=detectors, scenes=scenes, **shown)
     known = {"detections": detected}
     drive(Stage("detector_metrics", measures.detector_metrics), **known)
 
@@ -88,38 +86,32 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
             drive(Stage(f"numbers_{name}", comparison.play_numbers, shares="numbers"), **given)
 
 
+_Learned = tuple[tuple[Output, ...], Output, Output, Output, dict[str, Output]]
+"""Detectors, parameters of the JMVAE, class beliefs, detections, and what looks show together."""
+
+
 def _learn_from_detections(
-    drive: Drive, config: Config, arena: Arena, *, scenes: Output, surveys: Output, examples: Output
-) -> tuple[Output, Output, Output, Output]:
-    """Detectors, parameters of the JMVAE, class beliefs and detections; see `scans`."""
-    del scenes
-
-    def problem(config: Config, *, detections: Detections) -> jmvae.Fitting:
-        return jmvae.Fitting(config.jmvae, detections.bank, make_jmvae(config))
-
+    drive: Drive, config: Config, *, surveys: Output, examples: Output
+) -> _Learned:
+    """Trains detectors, and a JMVAE on what they say."""
     given = {"surveys": surveys, "examples": examples}
     stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
     trained = tuple(drive(stage, **given) for stage in stages)
     detected = drive(Stage("detections", detections.detect), surveys=surveys, trained=trained)
-    each = tuple(drive(stage, detections=detected) for stage in restarts(config, problem))
+    each = tuple(drive(stage, detections=detected) for stage in restarts(config, jmvaes.start))
     choose = Stage("best_jmvae", jmvaes.best)
     params = drive(choose, restarts=each, detections=detected)
     average = Stage("class_beliefs", jmvaes.class_beliefs)
     classes = drive(average, params=params, detections=detected)
-    drive(_novelty(arena), trained=trained)
-    return trained, params, classes, detected
+    return trained, params, classes, detected, {}
 
 
 def _learn_from_scans(
-    drive: Drive, config: Config, arena: Arena, *, scenes: Output, surveys: Output, examples: Output
-) -> tuple[Output, Output, Output, Output]:
-    """The same of a JMVAE that learns from scans, and whose encoders serve as detectors."""
-
-    def problem(config: Config, *, views: Views) -> leave_one_out.Fitting:
-        return leave_one_out.Fitting(config.jmvae, views.groups, make_scan_jmvae(config))
-
+    drive: Drive, config: Config, *, surveys: Output, examples: Output
+) -> _Learned:
+    """Trains a JMVAE on scans, whose encoders serve as detectors; see `scans`."""
     seen = drive(Stage("views", scans.views), surveys=surveys)
-    each = tuple(drive(stage, views=seen) for stage in restarts(config, problem))
+    each = tuple(drive(stage, views=seen) for stage in restarts(config, scans.start))
     params = drive(Stage("best_jmvae", jmvaes.best), restarts=each)
     learned = {"params": params, "views": seen, "surveys": surveys}
     classes = drive(Stage("class_beliefs", scans.class_beliefs), **learned)
@@ -130,12 +122,7 @@ def _learn_from_scans(
     find = Stage("detections", detections.detect)
     detected = drive(find, surveys=surveys, trained=trained, shown=shown)
     drive(Stage("grouped", scans.accuracies), **learned)
-    drive(_novelty(arena), trained=trained, scenes=scenes, shown=shown)
-    return trained, params, classes, detected
-
-
-def _novelty(arena: Arena) -> Stage:
-    return Stage("novelty", functools.partial(detections.learn_novelty, arena=arena))
+    return trained, params, classes, detected, {"shown": shown}
 
 
 def stages(config: Config, arena: Arena | None = None) -> list[Stage]:

@@ -7,7 +7,6 @@ from jaxsense.vae.detectors import features as features
 from jaxsense.vae.detectors import retrain as retrain
 from jaxsense.vae.fusion import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace
-from jaxsense.vae.fusion import fuse as fuse
 from jaxsense.vae.fusion import prior as prior
 from jaxsense.vae.gaussian import product_of_experts as product_of_experts
 from jaxsense.vae.jmvae import Jmvae as Jmvae

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config import DetectorConfig
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Key, product, pytree
 
 _NEVER = -1e9  # log-odds of what is no candidate; finite, so that there may be none
@@ -214,42 +215,40 @@ def init(
     )
 
 
-@pytree
-class Fitting:
-    """Problem of fitting a detector to looks at PoIs and half as many at nothing.
+def problem(
+    config: DetectorConfig,
+    detector: Classifier,
+    shown: Looks,
+    labels: Int[Array, " S"],
+    nothing: Looks,
+) -> Problem[_Rows]:
+    """The fit of a detector to looks at PoIs and half as many at nothing.
 
-    Attributes:
+    The loss is the mean cross-entropy of looks at PoIs, plus that of looks at nothing.
+
+    Args:
       config: batch, of looks at PoIs, learning rate and steps.
-      shown: looks at PoIs.
-      labels: `[S]` int32 their labels.
       nothing: looks that show no PoI.
     """
 
-    config: DetectorConfig
-    detector: Classifier
-    shown: Looks
-    labels: Int[Array, " S"]
-    nothing: Looks
-
-    def draw(self, key: Key, number: int) -> _Rows:
-        """Rows of the looks at PoIs, and of those at nothing, see `Problem.draw`."""
+    def draw(key: Key, number: int) -> _Rows:
         shown_key, nothing_key = jax.random.split(key)
-        batch = self.config.batch
-        shown = jax.random.randint(shown_key, (number, batch), 0, len(self.labels))
-        shape = number, -(-batch // 2)
-        return shown, jax.random.randint(nothing_key, shape, 0, len(self.nothing.distances))
+        of_shown = jax.random.randint(shown_key, (number, config.batch), 0, len(labels))
+        shape = number, -(-config.batch // 2)
+        return of_shown, jax.random.randint(nothing_key, shape, 0, len(nothing.distances))
 
-    def loss(self, params: Params, drawn: _Rows, step: Array) -> Float[Array, ""]:
-        """Mean cross-entropy of looks at PoIs, plus that of looks at nothing."""
+    def loss(params: Params, drawn: _Rows, step: Array) -> Float[Array, ""]:
         del step
-        detector, (shown, nothing) = dataclasses.replace(self.detector, params=params), drawn
+        of_shown, of_nothing = drawn
         looks = jax.tree.map(
-            lambda x, y: jnp.concatenate([x[shown], y[nothing]]), self.shown, self.nothing
+            lambda x, y: jnp.concatenate([x[of_shown], y[of_nothing]]), shown, nothing
         )
-        labels = jnp.pad(self.labels[shown], (0, len(nothing)), constant_values=-1)
-        found = log_probabilities(detector.of(looks))
-        cost = -jnp.take_along_axis(found, labels[None], axis=0)[0]
-        return cost[: len(shown)].mean() + cost[len(shown) :].mean()
+        of_looks = jnp.pad(labels[of_shown], (0, len(of_nothing)), constant_values=-1)
+        found = log_probabilities(dataclasses.replace(detector, params=params).of(looks))
+        cost = -jnp.take_along_axis(found, of_looks[None], axis=0)[0]
+        return cost[: len(of_shown)].mean() + cost[len(of_shown) :].mean()
+
+    return Problem(config, draw, loss)
 
 
 def fitted(detector: Classifier, shown: Looks, nothing: Looks) -> Classifier:
@@ -328,50 +327,30 @@ def retrain(
     if not 0 < number < len(labels):
         expected = f"must leave some of {len(labels)} looks to train with, and some to judge by"
         raise ValueError(f"config.calibration = {config.calibration}: {expected}")
-    problem = Relabelling(config, detector, shown, labels, number)
-    before = detector.params["params"][problem.last]
-    fit, _ = supervised.fit(key, supervised.start(before, config), problem, config.steps)
+    layers, last = detector.params["params"], f"Dense_{len(detector.hidden)}"
+
+    def retrained(layer: Params) -> Classifier:
+        return dataclasses.replace(detector, params={"params": {**layers, last: layer}})
+
+    def draw(key: Key, steps: int) -> Int[Array, "T B"]:
+        return jax.random.randint(key, (steps, config.batch), 0, number)
+
+    def loss(layer: Params, rows: Int[Array, " B"], step: Array) -> Float[Array, ""]:
+        del step
+        found = retrained(layer).of(jax.tree.map(lambda x: x[rows], shown))[:-1]
+        return _cross_entropy(found, labels[rows])
+
+    start = supervised.start(layers[last], config)
+    fit, _ = supervised.fit(key, start, Problem(config, draw, loss), config.steps)
 
     def moved(share: jax.Array) -> Params:
-        return jax.tree.map(lambda old, new: old + share * (new - old), before, fit.params)
+        return jax.tree.map(lambda old, new: old + share * (new - old), layers[last], fit.params)
 
     kept, shares = jnp.arange(number, len(labels)), jnp.linspace(0.0, 1.0, 21)
-    losses = jax.lax.map(lambda share: problem.loss(moved(share), kept, fit.step), shares)
+    losses = jax.lax.map(lambda share: loss(moved(share), kept, fit.step), shares)
     checks.require_finite("loss of retrained detectors", losses, "must be finite; retrain slower")
     best = jnp.where(jnp.isfinite(losses).all(), shares[jnp.argmin(losses)], jnp.nan)
-    return problem.retrained(moved(best))
-
-
-@pytree
-class Relabelling:
-    """Problem of fitting the last layer of a trained detector, see `retrain`."""
-
-    config: DetectorConfig
-    detector: Classifier
-    shown: Looks
-    labels: Int[Array, " S"]
-    number: int = struct.field(pytree_node=False)
-
-    @property
-    def last(self) -> str:
-        """Name of the last layer."""
-        return f"Dense_{len(self.detector.hidden)}"
-
-    def retrained(self, layer: Params) -> Classifier:
-        """The detector with another last layer."""
-        layers = {**self.detector.params["params"], self.last: layer}
-        return dataclasses.replace(self.detector, params={"params": layers})
-
-    def draw(self, key: Key, number: int) -> Int[Array, "{number} B"]:
-        """Rows of the looks to train with, see `Problem.draw`."""
-        return jax.random.randint(key, (number, self.config.batch), 0, self.number)
-
-    def loss(self, params: Params, drawn: Int[Array, " B"], step: Array) -> Float[Array, ""]:
-        """Mean cross-entropy of the labels."""
-        del step
-        found = self.retrained(params).of(jax.tree.map(lambda x: x[drawn], self.shown))[:-1]
-        cross_entropy = optax.softmax_cross_entropy_with_integer_labels
-        return cross_entropy(found, self.labels[drawn], 0).mean()
+    return retrained(moved(best))
 
 
 def sharpness(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Array, ""]:
@@ -379,8 +358,11 @@ def sharpness(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Ar
 
     Its inverse is the temperature of Guo et al. 2017, Sec. 4.2.
     """
-    cross_entropy = optax.softmax_cross_entropy_with_integer_labels
-    return _best_factor(lambda factor: cross_entropy(factor * logits, labels, 0).mean())
+    return _best_factor(lambda factor: _cross_entropy(factor * logits, labels))
+
+
+def _cross_entropy(logits: Float[Array, "L S"], labels: Int[Array, " S"]) -> Float[Array, ""]:
+    return optax.softmax_cross_entropy_with_integer_labels(logits, labels, 0).mean()
 
 
 def _best_factor(loss: Callable[[Float[Array, ""]], Float[Array, ""]]) -> Float[Array, ""]:

@@ -13,6 +13,7 @@ Log-likelihoods that are linear in the moments of the classes keep the weights a
 `readout` reads without error: a belief is a sufficient memory.
 """
 
+import functools
 import itertools
 from collections.abc import Mapping
 
@@ -23,9 +24,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config.learning import FilterConfig
+from jaxsense.config.learning import FilterConfig, JmvaeConfig
 from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Belief, Features, Key, Samples, product, pytree
 from jaxsense.vae import gaussian, jmvae, readout
 from jaxsense.vae.jmvae import Jmvae
@@ -77,12 +79,26 @@ class InPlace(Reader):
         modality: int,
         weight: Float[Array, ""] | float = 1.0,
     ) -> Belief:
-        """Belief after one more look, see `Fusion.update` and `fuse`; `weight` is not used."""
+        """Belief after one more look, see `Fusion.update`; `weight` is not used.
+
+        The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
+        """
         del weight
-        checks.require_modality(modality, self.model.modalities)
-        number = len(self.model.modalities)
-        of_all = tuple(features if m == modality else None for m in range(number))
-        return fuse(self.params, self.model, belief, seen, of_all)
+        model = self.model
+        checks.require_modality(modality, model.modalities)
+        chex.assert_shape(seen, (len(model.modalities),))
+        checks.require_belief("belief", belief, model.latent_size)
+        checks.require_probabilities(f"features of {model.modalities[modality]}", features)
+        generated, fused = jmvae.decode(self.params, model, belief.mean), belief
+        others = [m for m in range(len(model.modalities)) if m != modality]
+        has_looked = jnp.asarray(seen)[np.array(others, int)]
+        sizes = range(len(others) + 1)
+        # One encoder for each set of the others that may have looked; `seen` selects one.
+        for subset in itertools.chain(*(itertools.combinations(others, n) for n in sizes)):
+            candidate = self.together({**{m: generated[m] for m in subset}, modality: features})
+            applies = jnp.all(has_looked == np.isin(others, subset))
+            fused = jax.tree.map(functools.partial(jnp.where, applies), candidate, fused)
+        return fused
 
     def together(self, looks: Mapping[int, Float[Array, "_"]]) -> Belief:
         """Posterior `q(z|x)`, see `Fusion.together`."""
@@ -92,71 +108,33 @@ class InPlace(Reader):
         return jmvae.posterior(self.params, self.model, features)
 
 
-@checks.typed
-def fuse(
-    params: Params,
-    model: Jmvae,
-    belief: Belief,
-    seen: Bool[Array | np.ndarray, " M"],
-    features: Features,
-) -> Belief:
-    """Fuses looks by one sensor, or by several together, in place.
-
-    The first look yields `q(z|x)`. The old belief enters the new one only through the decoder.
-
-    Args:
-      belief: `[D]` before the looks.
-      seen: `[M]` bool, which modalities have looked before.
-      features: for each modality `[D_m]` new features, or None where it has not looked.
-    """
-    chex.assert_shape(seen, (len(model.modalities),))
-    checks.require_belief("belief", belief, model.latent_size)
-    generated = jmvae.decode(params, model, belief.mean)
-    is_new = np.array([new is not None for new in features])
-    others = np.flatnonzero(~is_new).tolist()
-    fused = belief
-    # One encoder for each set of modalities that may have looked before; `seen` selects one.
-    for size in range(len(others) + 1):
-        for subset in itertools.combinations(others, size):
-            inputs = tuple(generated[m] if m in subset else new for m, new in enumerate(features))
-            candidate = jmvae.posterior(params, model, inputs)
-            is_subset = np.array([m in subset for m in range(len(features))])
-            applies = jnp.all(is_new | (jnp.asarray(seen) == is_subset))
-            fused = jax.tree.map(lambda new, old: jnp.where(applies, new, old), candidate, fused)  # noqa: B023
-    for name, new in zip(model.modalities, features, strict=True):
-        if new is not None:
-            checks.require_probabilities(f"features of {name}", new)
-    return fused
-
-
-@pytree
-class Decoding(jmvae.Fitting):
-    """Problem of fitting the decoders to what fusion in place decodes: means of posteriors.
+def decoding(
+    config: JmvaeConfig, bank: Samples, model: Jmvae, params: Params
+) -> Problem[jmvae.Drawn]:
+    """The fit of the decoders to what fusion in place decodes: means of posteriors.
 
     The JMVAE decodes draws from `q(z|all)`, few of which lie near the mean of `q(z|s)` for a subset
-    s of the modalities. The encoders, of `params`, stay as they are.
+    s of the modalities. The encoders, of `params`, stay as they are. The loss is the mean of
+    `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2`.
     """
 
-    params: Params
+    def decoded(params: Params, features: Features) -> tuple[Array, ...]:
+        mean, _ = jmvae.encode(params, model, features)
+        return jmvae.decode(params, model, mean)
 
-    def loss(self, params: Params, drawn: jmvae.Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of `sum_s sum_{m in s} w_m |x_m - decode_m(E q(z|s))|^2 / 2` over a batch."""
+    def loss(decoders: Params, drawn: jmvae.Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
         del step
         _, features = drawn
-        whole, weights = {**self.params, "decoders": params}, self.config.reconstruction_weights
-        total = jnp.float32(0.0)
-        for subset in self.model.subsets:
+        whole, total = {**params, "decoders": decoders}, jnp.float32(0.0)
+        for subset in model.subsets:
             given = tuple(x if m in subset else None for m, x in enumerate(features))
-            decoded = jax.vmap(self._decoded, (None, -1), -1)(whole, given)
+            found = jax.vmap(decoded, (None, -1), -1)(whole, given)
             for m in subset:
-                squares = jnp.sum((features[m] - decoded[m]) ** 2, axis=0)
-                total += weights[m] * 0.5 * jnp.mean(squares)
+                squares = jnp.sum((features[m] - found[m]) ** 2, axis=0)
+                total += config.reconstruction_weights[m] * 0.5 * jnp.mean(squares)
         return total
 
-    def _decoded(self, params: Params, features: Features) -> tuple[Array, ...]:
-        """`[D_m]` features decoded from the mean of the posterior of some."""
-        mean, _ = jmvae.encode(params, self.model, features)
-        return jmvae.decode(params, self.model, mean)
+    return Problem(config, jmvae.problem(config, bank, model).draw, loss)
 
 
 @checks.typed
@@ -242,39 +220,32 @@ def init_filter(
     return Filter(classes, prior, read, model, silent, hidden)
 
 
-@pytree
-class Filtering:
-    """Problem of fitting a filter's networks to random histories of looks from a bank."""
+def filtering(config: FilterConfig, untrained: Filter, bank: Samples) -> Problem[Drawn]:
+    """The fit of a filter's networks to random histories of looks from a bank.
 
-    config: FilterConfig
-    filter: Filter
-    bank: Samples
+    The loss is the mean divergence from the joint posterior of the true class to the beliefs.
+    """
+    classes = untrained.classes
 
-    def draw(self, key: Key, number: int) -> Drawn:
-        """Histories of looks, see `Problem.draw`."""
-        bank, shape = self.bank, (number, _LOOKS, _BATCH)
+    def draw(key: Key, number: int) -> Drawn:
+        shape = number, _LOOKS, _BATCH
         class_key, sensor_key, *row_keys = jax.random.split(key, 2 + len(bank))
-        classes = jax.random.randint(class_key, (number, _BATCH), 0, len(bank[0]))
+        true_class = jax.random.randint(class_key, (number, _BATCH), 0, len(bank[0]))
         sensors = jax.random.randint(sensor_key, shape, 0, len(bank))
         looks = tuple(
-            jnp.moveaxis(x[classes[:, None], jax.random.randint(k, shape, 0, x.shape[1])], -1, 1)
+            jnp.moveaxis(x[true_class[:, None], jax.random.randint(k, shape, 0, x.shape[1])], -1, 1)
             for x, k in zip(bank, row_keys, strict=True)
         )
-        return classes, sensors, looks
+        return true_class, sensors, looks
 
-    def loss(
-        self, params: dict[str, Params], drawn: Drawn, step: Int[Array, ""]
-    ) -> Float[Array, ""]:
-        """Mean divergence from the joint posterior of the true class to the beliefs."""
+    def loss(params: dict[str, Params], drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
         del step
         true_class, sensor, looks = drawn
-        number, classes = len(self.bank), self.filter.classes
         flat = [
-            self.filter.log_likelihood(params, x.reshape(len(x), -1), m)
-            for m, x in enumerate(looks)
+            untrained.log_likelihood(params, x.reshape(len(x), -1), m) for m, x in enumerate(looks)
         ]
-        found = jnp.stack(flat).reshape(number, -1, sensor.shape[0], sensor.shape[1])
-        is_used = sensor[None, None] == jnp.arange(number)[:, None, None, None]
+        found = jnp.stack(flat).reshape(len(bank), -1, *sensor.shape)
+        is_used = sensor[None, None] == jnp.arange(len(bank))[:, None, None, None]
         added = jnp.sum(jnp.where(is_used, found, 0.0), axis=0)
         probabilities = jax.nn.softmax(jnp.cumsum(added, axis=1), axis=0)
         mix = jax.vmap(jax.vmap(lambda p: readout.mixture(classes, p), -1, -1), -1, -1)
@@ -282,3 +253,5 @@ class Filtering:
         beliefs = mix(probabilities)  # [D, T, B]
         p, q = ((x.mean, 2 * jnp.log(x.std)) for x in (truth, beliefs))
         return jnp.mean(gaussian.kl_divergence(*p, *q))
+
+    return Problem(config, draw, loss)

@@ -12,14 +12,14 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float, Int
 
 from jaxsense.config import JmvaeConfig
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks, networks, supervised
 from jaxsense.core.networks import MLP, Params
-from jaxsense.core.types import Belief, Features, Key, Samples, pytree
+from jaxsense.core.supervised import Problem
+from jaxsense.core.types import Belief, Features, Key, Samples
 from jaxsense.vae import gaussian
 
 _CONVERGES = "must be finite; scale features to a deviation of 1, or lower learning_rate"
@@ -208,47 +208,39 @@ def losses(
     return reconstruction + beta * prior + alpha * subsets, parts
 
 
-@pytree
-class Fitting:
-    """Problem of fitting a JMVAE to features.
+def problem(config: JmvaeConfig, bank: Samples, model: Jmvae) -> Problem[Drawn]:
+    """The fit of a JMVAE to features.
 
     A training example is one look by each modality at the same class, independent given the class.
     """
 
-    config: JmvaeConfig
-    bank: Samples
-    model: Jmvae = struct.field(pytree_node=False)
-
-    def init(self, key: Key) -> Params:
-        """Random parameters to start from."""
-        return init(key, self.model)
-
-    def draw(self, key: Key, number: int) -> Drawn:
-        """Noise, and features from the bank, see `Problem.draw`."""
-        shape = number, self.config.batch
-        columns = [jnp.moveaxis(x, -1, 0) for x in self.bank]
+    def draw(key: Key, number: int) -> Drawn:
+        shape = number, config.batch
+        columns = [jnp.moveaxis(x, -1, 0) for x in bank]
         class_key, noise_key, *row_keys = jax.random.split(key, 2 + len(columns))
-        classes = jax.random.randint(class_key, shape, 0, self.bank[0].shape[0])
+        classes = jax.random.randint(class_key, shape, 0, bank[0].shape[0])
         features = [
             jnp.moveaxis(x[:, classes, jax.random.randint(k, shape, 0, x.shape[-1])], 1, 0)
             for x, k in zip(columns, row_keys, strict=True)
         ]
-        noise = jax.random.normal(noise_key, (number, self.model.latent_size, shape[1]))
+        noise = jax.random.normal(noise_key, (number, model.latent_size, shape[1]))
         return noise, tuple(features)
 
-    def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses` of a batch; the step determines beta."""
+    def loss(params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
         noise, features = drawn
+        weights, beta = config.reconstruction_weights, annealed_beta(step, config)
         total, _ = losses(
             noise,
             params,
-            self.model,
+            model,
             features,
-            alpha=self.config.alpha,
-            beta=annealed_beta(step, self.config),
-            reconstruction_weights=self.config.reconstruction_weights,
+            alpha=config.alpha,
+            beta=beta,
+            reconstruction_weights=weights,
         )
         return jnp.mean(total)
+
+    return Problem(config, draw, loss)
 
 
 @checks.typed
@@ -276,13 +268,13 @@ def train(
     """
     require_32_bits()
     _require_bank(bank, model)
-    problem, state = Fitting(config, bank, model), supervised.start(params, config)
+    state = supervised.start(params, config)
     number = min(config.steps, 100)  # whose draws are in memory together
     chunks = -(-config.steps // number)
     keys = jax.random.split(key, chunks) if chunks > 1 else key[None]
 
     def chunk(state: supervised.FitState, key: Key) -> tuple[supervised.FitState, jax.Array]:
-        return supervised.fit(key, state, problem, number)
+        return supervised.fit(key, state, problem(config, bank, model), number)
 
     state, losses = jax.lax.scan(chunk, state, keys)
     checks.require_finite("losses", losses, _CONVERGES)

@@ -10,6 +10,7 @@ so it takes any number of looks by each sensor in any order.
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import JmvaeConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
+from jaxsense.core.supervised import Problem
 from jaxsense.core.types import Belief, Key, product, pytree
 from jaxsense.vae import detectors, gaussian
 from jaxsense.vae.detectors import Classifier
@@ -44,18 +46,16 @@ def init(key: Key, model: Jmvae) -> Params:
     number = len(model.modalities)
     joint_key, *keys = jax.random.split(key, 1 + 3 * number)
 
-    def of_each(keys: list[Key], network: MLP) -> Params:
-        each = zip(model.modalities, keys, model.feature_sizes, strict=True)
-        return {name: networks.init(key, network, size) for name, key, size in each}
+    def of_each(first: int, network: Callable[[int], MLP], sizes: Sequence[int]) -> Params:
+        return {
+            name: networks.init(keys[first * number + m], network(m), sizes[m])
+            for m, name in enumerate(model.modalities)
+        }
 
-    decoders = {
-        name: networks.init(keys[2 * number + m], model.decoder(m), model.latent_size)
-        for m, name in enumerate(model.modalities)
-    }
     return {
-        "encoders": of_each(keys[:number], model.encoder),
-        "embeddings": of_each(keys[number : 2 * number], _embedding(model)),
-        "decoders": decoders,
+        "encoders": of_each(0, lambda _: model.encoder, model.feature_sizes),
+        "embeddings": of_each(1, lambda _: _embedding(model), model.feature_sizes),
+        "decoders": of_each(2, model.decoder, [model.latent_size] * number),
         "joint": networks.init(joint_key, _joint(model), number * _EMBEDDING),
     }
 
@@ -142,42 +142,32 @@ def losses(
     return total + draws(*_of_means(params, model, found))
 
 
-@pytree
-class Fitting:
-    """Problem of fitting the JMVAE to groups of looks, each sensor's in its frame."""
+def problem(config: JmvaeConfig, groups: Groups, model: Jmvae) -> Problem[Drawn]:
+    """The fit of the JMVAE to groups of looks, each sensor's in its frame."""
 
-    config: JmvaeConfig
-    groups: Groups
-    model: Jmvae = struct.field(pytree_node=False)
-
-    def init(self, key: Key) -> Params:
-        """Random parameters to start from."""
-        return init(key, self.model)
-
-    def draw(self, key: Key, number: int) -> Drawn:
-        """PoIs and noise, see `Problem.draw`."""
+    def draw(key: Key, number: int) -> Drawn:
         row_key, noise_key = jax.random.split(key)
-        batch, looks = self.config.batch, self.groups[0].shape[1]
-        rows = jax.random.randint(row_key, (number, batch), 0, len(self.groups[0]))
-        size = (number, len(self.groups), self.model.latent_size, batch, looks)
+        batch, looks = config.batch, groups[0].shape[1]
+        rows = jax.random.randint(row_key, (number, batch), 0, len(groups[0]))
+        size = (number, len(groups), model.latent_size, batch, looks)
         return rows, jax.random.normal(noise_key, size)
 
-    def loss(self, params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
-        """Mean of the `losses` of a batch; the step determines alpha and beta."""
+    def loss(params: Params, drawn: Drawn, step: Int[Array, ""]) -> Float[Array, ""]:
         rows, noise = drawn
-        share = step / self.config.steps
-        has_begun = jnp.clip((share - _ALPHA_START) / _ALPHA_RAMP, 0.0, 1.0)
+        share = step / config.steps
         of_each = losses(
             noise,
             params,
-            self.model,
-            tuple(x[rows] for x in self.groups),
-            alpha=self.config.alpha,
-            beta=annealed_beta(step, self.config),
-            has_begun=has_begun,
-            reconstruction_weights=self.config.reconstruction_weights,
+            model,
+            tuple(x[rows] for x in groups),
+            alpha=config.alpha,
+            beta=annealed_beta(step, config),
+            has_begun=jnp.clip((share - _ALPHA_START) / _ALPHA_RAMP, 0.0, 1.0),
+            reconstruction_weights=config.reconstruction_weights,
         )
         return jnp.mean(of_each)
+
+    return Problem(config, draw, loss)
 
 
 @pytree

@@ -5,7 +5,7 @@ import inspect
 import pytest
 
 import jaxsense
-from jaxsense import dqn, mission, sim, tasks, vae
+from jaxsense import dqn, mission, recorded, sim, tasks, vae
 
 # Of arrays, and called while a scan or a step is traced: nothing is checked on the host.
 KERNELS = {"cast", "choose", "cross_section", "place"}
@@ -17,8 +17,8 @@ def required(function):
 
 
 FUNCTIONS = {
-    name: getattr(module, name)
-    for module in (jaxsense, dqn, mission, sim, tasks, vae)
+    f"{module.__name__}.{name}": getattr(module, name)
+    for module in (jaxsense, dqn, mission, recorded, sim, tasks, vae)
     for name in {*dir(module)} - KERNELS
     if inspect.isroutine(getattr(module, name)) and required(getattr(module, name))
 }

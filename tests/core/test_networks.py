@@ -44,3 +44,12 @@ def test_inputs_are_standardised_by_each_mean_and_one_deviation():
     np.testing.assert_array_equal(offset, [2.0, 4.0])
     assert scale == pytest.approx(2.5**0.5)
     assert networks.statistics(jnp.ones((3, 2)))[1] > 0
+
+
+def test_the_last_layer_is_scaled_as_a_whole_or_output_by_output():
+    network = networks.MLP((4,), 2)
+    params = networks.init(jax.random.key(0), network, 3)
+    before = network.apply(params, jnp.ones(3))
+    for factor in (0.25, jnp.array([2.0, -1.0])):
+        found = network.apply(networks.scale_last(network, params, factor), jnp.ones(3))
+        np.testing.assert_allclose(found, factor * before, rtol=1e-6)

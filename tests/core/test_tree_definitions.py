@@ -1,16 +1,10 @@
 """The class belongs to the tree definition: no program of one class runs with another."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
-import numpy as np
-import pytest
-from flax import serialization
 
 from jaxsense import sim
-from jaxsense.config import Config
-from jaxsense.core.types import Belief, pytree
+from jaxsense.core.types import Belief, by_place, others, pytree
 
 
 def own_reward(value):
@@ -40,15 +34,13 @@ def test_a_class_that_is_defined_again_runs_its_own_program():
     assert wrong_programs(12) == 0
 
 
-def test_state_dictionaries_are_those_of_earlier_checkpoints():
-    belief = Belief(jnp.arange(2.0), jnp.ones(2))
-    state = serialization.to_state_dict(belief)
-    assert list(state) == ["mean", "std"]
-    blank = jax.tree.map(jnp.zeros_like, belief)
-    found = serialization.from_state_dict(blank, state)
-    np.testing.assert_array_equal(found.mean, [0, 1])
-    with pytest.raises(ValueError, match="Belief"):
-        serialization.from_state_dict(blank, {"mean": state["mean"]})
+def test_leaves_are_found_by_their_places():
+    tree = {"a": (Belief(1, 2),), "b": {"c": 3}}
+    assert by_place(tree) == {"a/0/mean": 1, "a/0/std": 2, "b/c": 3}
+
+
+def test_all_rows_but_one_begin_after_it():
+    assert others(jnp.arange(4), 1).tolist() == [2, 3, 0]
 
 
 def own_sensor(value):
@@ -66,15 +58,3 @@ def test_a_sensor_that_is_defined_again_runs_its_own_program():
     own = [own_sensor(float(value)) for value in range(12)]
     assert [float(read(sensor)) for sensor in own] == list(range(12))
     assert jax.tree.structure(own[0]) != jax.tree.structure(own[1])
-
-
-def test_a_traced_setting_does_not_switch_off_the_checks_of_others():
-    config = Config()
-
-    def change(distance, **wrong):
-        viewpoint = dataclasses.replace(config.viewpoint, min_distance=distance)
-        return dataclasses.replace(config, viewpoint=viewpoint, **wrong).viewpoint.min_distance
-
-    assert float(jax.jit(change)(0.4)) == pytest.approx(0.4)
-    with pytest.raises(ValueError, match="robots"):
-        jax.jit(lambda x: change(x, robots=("camera", "nose")))(0.4)

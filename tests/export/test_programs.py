@@ -20,7 +20,7 @@ from jaxsense.dqn import Travel
 from jaxsense.interfaces import robot
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
-from jaxsense.tasks.pretrained import PRETRAINED
+from jaxsense.tasks.registry import PRETRAINED
 from jaxsense.vae import detectors, readout
 
 BATCH = 12

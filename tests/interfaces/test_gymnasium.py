@@ -19,7 +19,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import jaxsense
-from jaxsense.config import ConfigError
 from jaxsense.interfaces import gymnasium as ours
 from jaxsense.interfaces import prepared_starts
 from jaxsense.interfaces.gymnasium import MapVectorEnv
@@ -34,7 +33,7 @@ def starts():
 
 @pytest.fixture
 def make(starts):
-    return functools.partial(MapVectorEnv, small.small_mdp(), LIDAR, starts=starts)
+    return functools.partial(MapVectorEnv, small.small_mdp().of(LIDAR), starts=starts)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
@@ -75,6 +74,8 @@ def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
 @pytest.mark.parametrize("kind", [list, np.array])
 def test_without_autoreset_only_the_masked_environments_start_again(make, kind):
     env = make(num_envs=3, autoreset_mode="Disabled")
+    with pytest.raises(ResetNeeded, match="before reset"):
+        env.step(np.zeros(3, int))
     env.reset(seed=0)
     before, _, terminations, _, _ = env.step(np.array([NOP, 0, NOP]))
     with pytest.raises(ResetNeeded, match=r"\[0 2\] have ended"):
@@ -90,7 +91,7 @@ def test_the_mdp_is_an_input_of_the_programs(make):
     other = dataclasses.replace(mdp, looks=jax.tree.map(lambda x: x[::-1], mdp.looks))
     seen, programs = [], []
     for each in (mdp, other):
-        env = MapVectorEnv(each, LIDAR, 3, make.keywords["starts"])
+        env = MapVectorEnv(each.of(LIDAR), num_envs=3, starts=make.keywords["starts"])
         env.reset(seed=3)
         seen.append(env.step(np.zeros(3, int))[0])
         programs.append((ours._start._cache_size(), ours._step._cache_size()))
@@ -147,23 +148,11 @@ def test_pictures_show_what_changes():
         envs.render()
     envs.reset(seed=3)
     before = envs.render()
-    assert [(x.shape, x.dtype) for x in before] == [((400, 800, 3), np.uint8)] * 2
+    assert [(x.shape, x.dtype) for x in before] == [((400, 400, 3), np.uint8)] * 2
     envs.step(np.array([0, NOP]))  # the second episode ends
     after = envs.render()
     assert all(np.any(x != y) for x, y in zip(before, after, strict=True))
     env = gymnasium.make("jaxsense/map-v0", render_mode="rgb_array")
     env.reset(seed=3)
-    assert env.render().shape == (400, 800, 3)
+    assert env.render().shape == (400, 400, 3)
     assert gymnasium.make("jaxsense/map-v0").unwrapped.render() is None
-
-
-def test_what_cannot_be_is_told(make):
-    env = make(num_envs=3)
-    with pytest.raises(ResetNeeded, match="before reset"):
-        env.step(np.zeros(3, int))
-    with pytest.raises(ValueError, match="render_mode = 'ansi': must be one of"):
-        ours.TaskEnv("map-v0", render_mode="ansi")
-    with pytest.raises(ConfigError, match="agent = 'sonar': must be one of camera, lidar"):
-        gymnasium.make("jaxsense/map-v0", agent="sonar")
-    with pytest.raises(ValueError, match="modality = 0: must be None with a task"):
-        MapVectorEnv(jaxsense.make("map-v0"), 0)

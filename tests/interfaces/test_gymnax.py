@@ -20,7 +20,7 @@ LIDAR, NOP = 1, 3
 
 @pytest.fixture(scope="module")
 def env():
-    return MapEnv(small.small_mdp(), LIDAR)
+    return MapEnv(small.small_mdp().of(LIDAR))
 
 
 @pytest.fixture(scope="module")

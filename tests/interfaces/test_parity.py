@@ -9,7 +9,7 @@ import pytest
 import small
 
 import jaxsense
-from jaxsense.tasks.environment import Environment
+from jaxsense.tasks.task import Environment
 
 SEED, NUMBER = 3, 6
 WORD = np.random.Generator(np.random.PCG64(np.random.SeedSequence(SEED))).integers(2**32)

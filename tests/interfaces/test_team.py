@@ -22,7 +22,7 @@ def robots():
 
 @jax.jit
 def reset(key, robots):
-    return robots.reset(key)
+    return robots.played.reset(key)[1]
 
 
 @jax.jit
@@ -31,8 +31,9 @@ def step(key, robots, state, actions):
 
 
 def with_limit(robots, number):
-    config = dataclasses.replace(robots.mdp.config, max_steps=number)
-    return dataclasses.replace(robots, mdp=dataclasses.replace(robots.mdp, config=config))
+    mdp = robots.played.mdp
+    mdp = dataclasses.replace(mdp, config=dataclasses.replace(mdp.config, max_steps=number))
+    return dataclasses.replace(robots, played=dataclasses.replace(robots.played, mdp=mdp))
 
 
 def test_the_whole_team_starts_and_is_never_alone(robots):
@@ -40,7 +41,7 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
     one_each = robots_of(small.team(), dataclasses.replace(small.TEAM, robots=None))
     assert one_each.names == ("camera", "lidar")
     keys = jax.random.split(jax.random.key(1), 64)
-    states = jax.jit(jax.vmap(robots.reset))(keys)
+    states = jax.jit(jax.vmap(lambda key: robots.played.reset(key)[1]))(keys)
     assert states.team.works.all()
     assert states.asks.all()
     np.testing.assert_array_equal(states.team.modality, [[0, 0, 1]] * 64)
@@ -51,7 +52,7 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
 
 
 def test_every_step_equals_the_mdps(robots):
-    mdp = robots.mdp
+    mdp = robots.played.mdp
     mdp_step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
     observe = jax.jit(lambda s, r: surroundings(mdp.travel, s.belief, s.team, r, 2))
     state = expected = reset(jax.random.key(3), robots)
@@ -78,7 +79,7 @@ def test_every_step_equals_the_mdps(robots):
         np.testing.assert_array_equal(found.terminated, ~works)
         assert not found.truncated.any()
         for r, seen in enumerate(found.observation):
-            np.testing.assert_allclose(seen, observe(expected, r).reshape(-1), atol=1e-5)
+            np.testing.assert_allclose(seen, observe(expected, r).T.reshape(-1), atol=1e-5)
     # All three choose at the start, and then whoever has looked.
     assert turns[:3] == [0, 1, 2]
     assert looks > 5

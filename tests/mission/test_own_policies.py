@@ -1,6 +1,5 @@
 """Policies of missions: those of the table, and one of the user's own."""
 
-import contextlib
 from dataclasses import replace
 
 import jax
@@ -13,7 +12,8 @@ from jaxsense.config import ConfigError
 from jaxsense.dqn.policies import Policy
 from jaxsense.mission.outcome import require_playable
 from jaxsense.mission.state import DRIVING, FAILED
-from jaxsense.run import output, pipeline, programs
+from jaxsense.run import output, programs
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 
 
@@ -91,8 +91,7 @@ def playing(*names):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("bytes_per_detection", "must not be all, policies, bytes_per_detection"),
-        ("all", "must not be all, policies, bytes_per_detection"),
+        ("all", "must not be all, policies"),
         ("latent", "must not be latent, network, greedy, "),
         ("a/b", "must be a word of 1 to 64 letters"),
         (" ", "must be a word of 1 to 64 letters"),
@@ -110,13 +109,11 @@ RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]
 def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatch):
     given = []
 
-    @contextlib.contextmanager
-    def compiled(config, monitor, workers, kept, trainings, policies):
-        given.append((config.mission.policies, kept, policies))
+    def compiled(config, compiler, workers, trainings, policies):
+        given.append((config.mission.policies, compiler.kept, policies))
         raise Stopped
-        yield
 
-    monkeypatch.setattr(train.pipeline, "compiled", compiled)
+    monkeypatch.setattr(train, "Programs", compiled)
     argv = [*RUN, "--out", str(tmp_path / "run"), "--cache", str(tmp_path / "cache")]
     with pytest.raises(SystemExit) as stop:
         train.main(argv, policies=OWN)
@@ -128,13 +125,10 @@ def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
     played = lambda mission, compiler, total, workers: mission  # noqa: E731
     monkeypatch.setattr(programs.missions, "Player", played)
     monkeypatch.setattr(programs.stages, "train", lambda drive, config, arena: None)
-    with pipeline.compiled(playing("mine"), Monitor(), policies=OWN) as made:
-        assert [*made.player.result().policies] == ["mine"]
-    with (
-        pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"),
-        pipeline.compiled(playing("mine"), Monitor()),
-    ):
-        pass
+    made = programs.Programs(playing("mine"), Compiler(Monitor()), policies=OWN)
+    assert [*made.player.result().policies] == ["mine"]
+    with pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"):
+        require_playable(playing("mine"))
 
 
 def test_evaluate_plays_own_policies_and_keeps_no_programs(tmp_path, monkeypatch, models, capsys):

@@ -13,7 +13,7 @@ from teams import CONFIG, NAIVE, with_config
 from jaxsense import mission
 from jaxsense.core.types import Belief
 from jaxsense.mission.state import Record
-from jaxsense.run import devices, ledger, missions
+from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -21,7 +21,7 @@ from jaxsense.run.monitor import Monitor, StageError, Stopped
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")
 KEY = jax.random.key(5)
-CHUNK = ledger.CHUNK
+CHUNK = missions.CHUNK
 SHORT = dataclasses.replace(CONFIG.mission, time_limit=30.0)
 LAST = 2 * CHUNK - 3  # control periods, within the second chunk
 
@@ -113,7 +113,7 @@ def walk_of(episode, shape):
 def test_missions_begin_with_the_models_that_play_them(play, models):
     prior = Belief(jnp.array([0.5, -1.0]), jnp.array([2.0, 3.0]))
     fusion = dataclasses.replace(models.fusion, prior=prior)
-    end = play(models=dataclasses.replace(models, fusion=fusion)).recording.end
+    end = play(models=dataclasses.replace(models, fusion=fusion)).recordings["naive"].end
     np.testing.assert_array_equal(end.belief.mean, [[0.5, -1.0]] * 3)
 
 
@@ -121,7 +121,8 @@ def test_missions_begin_with_the_models_that_play_them(play, models):
 def test_the_whole_first_mission_is_recorded(split, play):
     played = play(split)
     np.testing.assert_array_equal(played.metrics["naive"]["steps"], np.full(9, LAST))
-    records, end = played.recording.records, played.recording.end
+    recording = played.recordings["naive"]
+    records, end = recording.records, recording.end
     walk = walk_of(0, end.scene.poses.shape)
     assert len(records.time) == 2 * CHUNK
     np.testing.assert_array_equal(records.time, np.minimum(np.arange(2 * CHUNK) + 1, LAST))
@@ -135,7 +136,8 @@ def test_the_whole_first_mission_is_recorded(split, play):
 @pytest.mark.parametrize("split", WORKERS)
 def test_naive_exploration_is_recorded_with_the_first_mission(split, play, team):
     played = play(split, policies=("random", "latent", "naive"))
-    for recording, name in ((played.recording, "random"), (played.naive, "naive")):
+    assert [*played.recordings] == ["random", "naive"]
+    for name, recording in played.recordings.items():
         walk = walk_of(0, recording.end.scene.poses.shape)
         np.testing.assert_allclose(recording.records.poses[:LAST], walk, atol=1e-4)
         np.testing.assert_array_equal(recording.end.scene.poses, recording.records.poses[-1])
@@ -166,7 +168,7 @@ def test_results_do_not_depend_on_how_many_missions_play_at_once(split, play):
     assert len(set(many.metrics["naive"]["steps"].tolist())) > 3
     chex.assert_trees_all_equal(few.metrics, many.metrics)
     assert few.control_steps == many.control_steps == many.metrics["naive"]["steps"].sum()
-    chex.assert_trees_all_equal(few.recording, many.recording)
+    chex.assert_trees_all_equal(few.recordings, many.recordings)
 
 
 @pytest.mark.slow  # the physics of two batch sizes is compiled

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsense.config import CameraConfig, LidarConfig
 from jaxsense.recorded import resampling
-from jaxsense.recorded.reading import resample
+from jaxsense.recorded.looks import resample
 from jaxsense.sim import sensors
 
 LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
@@ -20,6 +20,7 @@ def degrees(*values):
     ("angles", "ranges", "expected"),
     [
         ([0, 0.1], [1, 1, 1], r"readings have the shape \(3,\): must be one for each of 2 angles"),
+        ([0], [1], "angles of 1 rays: must be of two or more"),
         ([0, np.nan], [1, 1], r"angles = nan: must be from -2 pi to 2 pi \(in radians\?\)"),
         ([-180, 180], [1, 1], "angles = -180: must be from -2 pi to 2 pi"),
     ],
@@ -34,7 +35,7 @@ def test_a_scan_along_no_directions_is_refused(angles, ranges, expected):
 def test_distances_are_interpolated_on_a_surface_and_nearest_at_an_edge():
     angles = degrees(-35, -25, -15, -5, 5, 15, 25, 35)
     #                     surface          edge      no return
-    readings = np.array([[1.0, 1.08, 1.04, 3.0, 3.02, np.inf, np.inf, 2.0]])
+    readings = np.array([[1.0, 1.08, 1.04, 3.0, 3.02, 0.0, np.inf, 2.0]])
     found = resample(LIDAR, angles + degrees(1)[0], readings)[0]
     # The ray at -40 is 6 degrees beyond the first, more than half a step; that at 40 is 4 beyond.
     np.testing.assert_array_equal(np.isnan(found), [True, *[False] * 8])
@@ -67,19 +68,16 @@ def test_a_full_circle_is_closed():
 
 def test_pixels_are_interpolated_for_each_channel():
     angles = np.linspace(0.8, -0.8, 60)
-    colour = np.stack([angles, angles**2, np.ones(60)], axis=-1)[None]
+    colour = np.stack([angles, angles**2, np.zeros(60)], axis=-1)[None]
     found = resample(CAMERA, angles, colour)[0]
-    expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.ones(8)], axis=-1)
+    expected = np.stack([CAMERA.angles, CAMERA.angles**2, np.zeros(8)], axis=-1)
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize(
     ("angles", "reason"),
     [
-        (
-            degrees(-40, 0, 40),
-            r"step between the rays of lidar = 40.00 degrees: must be at most 30",
-        ),
+        (degrees(-40, 0, 40), r"step between the rays of lidar = 40.00 degrees: must be at most"),
         (degrees(0), r"step between the rays of lidar = inf degrees"),
         (degrees(0, 5, 10), r"2 rays of lidar were recorded: must be at least 3, as wide as the"),
         (degrees(*range(150, 211, 10)), "0 rays of lidar were recorded: must"),
@@ -144,6 +142,8 @@ def test_a_gap_wider_than_three_steps_of_the_rays_that_are_read_was_not_recorded
     assert resampling.covered(targets, angles, step=np.radians(2.0)).all()
     # One ray has no step: that of the recorded ones counts.
     assert resampling.covered(np.zeros(1), np.radians([-5.0, 5.0, 15.0])).all()
+    # Two have one, .2 of what is between those that were recorded.
+    assert not resampling.covered(np.radians([0.0, 2.0]), np.radians([-5.0, 5.0])).any()
     assert not resampling.covered(np.zeros(1), np.radians([100.0, 101.0, 102.0])).any()
 
 
@@ -163,6 +163,15 @@ def test_short_gaps_between_beams_are_closed():
         assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.float32(scan))
     np.testing.assert_array_equal(close_gaps([1.0, inf, inf, 4.0], 1)[1:3], inf)
+
+
+@pytest.mark.parametrize(
+    ("angles", "ranges", "told"),
+    [([0, 90], [1, 1], "angles = 90: must be from"), ([0, 1], [1, 1, 1], "one for each of 2")],
+)
+def test_gaps_between_no_directions_are_refused(angles, ranges, told):
+    with pytest.raises(ValueError, match=told):
+        resampling.close_gaps(np.float64(angles), np.float64(ranges))
 
 
 def close_gaps(ranges, *most):

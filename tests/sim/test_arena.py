@@ -94,6 +94,8 @@ def test_robot_has_the_urdf_sizes_and_mass(arena):
     left, right = (arena.mj_model.geom(f"robot0_{side}_wheel") for side in ("left", "right"))
     np.testing.assert_allclose(left.size[:2], [0.05571 / 2, 0.006 / 2])
     np.testing.assert_allclose(left.pos - right.pos, [0, 0.069, 0], atol=1e-9)
+    # The box of the laser scanner, .094 to .164 m above the floor.
+    np.testing.assert_allclose(arena.mj_model.geom("robot1_lidar").size[2], 0.035)
     assert arena.mj_model.body("robot0").mass == pytest.approx(0.4 + 2 * 0.02)
 
 

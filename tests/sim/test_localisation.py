@@ -57,6 +57,15 @@ def simulation():
     return world.make_world(PRESETS["smoke"])
 
 
+def test_looks_of_training_have_errors_only_if_they_are_asked_for(simulation):
+    for in_training in (False, True):
+        errors = LocalisationConfig(in_training=in_training, error=(0.01, 2.0))
+        mission = replace(PRESETS["smoke"].mission, localisation=errors)
+        found = world.make_world(replace(PRESETS["smoke"], mission=mission))
+        assert found.localisation == (errors if in_training else None)
+        assert found.arena is simulation.arena
+
+
 def test_training_looks_have_the_bearing_and_distance_of_a_misplaced_robot(simulation):
     errors = LocalisationConfig(error=(0.01, 2.0))
     keys = jax.random.split(jax.random.key(0), 20_000)

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +47,8 @@ def test_viewpoints_face_the_poi_in_range(draws):
     error = np.degrees(believed) - bearing
     assert -1.01 <= error.min() < -0.9
     assert 0.9 < error.max() <= 1.01
+    # Of one another, they tell nothing.
+    assert np.abs(np.corrcoef([distance, bearing, error]) - np.eye(3)).max() < 0.1
 
 
 def test_viewpoints_are_free_and_see_the_whole_poi(draws):
@@ -68,6 +72,23 @@ def test_viewpoints_are_free_and_see_the_whole_poi(draws):
             sees &= (away > radius - 1e-3).all(axis=-1)
     assert (stands & sees).mean() >= 0.995
     assert np.linalg.norm(target - here, axis=-1).min() > 0.141421 + 0.0495
+
+
+@pytest.mark.parametrize(("above", "is_first"), [(0.5, True), (9.0, False)])
+def test_the_first_free_viewpoint_is_taken_or_that_with_the_most_room(monkeypatch, above, is_first):
+    rooms = []
+
+    def free_room(x, *_):
+        rooms.append(x - above)
+        return rooms[-1]
+
+    monkeypatch.setattr(viewpoints, "free_room", free_room)
+    layout, nobody = SimpleNamespace(position=jnp.zeros((3, 2))), jnp.zeros((0, 2))
+    given = ViewpointConfig(), ArenaConfig(), layout, nobody, 0
+    pose, _ = viewpoints.random_viewpoint(jax.random.key(0), *given)
+    first, most = np.argmax(rooms[0] > 0), np.argmax(rooms[0])
+    assert 0 != first != most if is_first else first == 0 != most
+    assert pose[0] == pytest.approx(float(rooms[0][first if is_first else most] + above), rel=1e-5)
 
 
 @jax.jit

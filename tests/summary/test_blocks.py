@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from summaries import BYTES, CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
+from summaries import CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
 
 from jaxsense.summary import blocks
 from jaxsense.summary.blocks import BLOCKS
@@ -15,17 +15,15 @@ RARE |= {"jmvae.grouped.pair", "jmvae.grouped.all_looks"}
 RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
 RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
 RARE |= {f"evaluations.NAME.origin.{key}" for key in ORIGIN}
-OF_ALL_NAIVE = {key for key in KEYS if ".of_naive." in key}
 
 
 def keys(value, key=""):
     """The keys of a summary up to those in the table, with MODALITY, POLICY and STAGE for names."""
     if not isinstance(value, dict) or {key, f"evaluations.NAME.{key}"} & KEYS:
         return {key}
-    place = {"detectors": "MODALITY", "dqn": "MODALITY", "timing.stages": "STAGE"}.get(key)
+    places = {"detectors": "MODALITY", "dqn": "MODALITY", "timing.stages": "STAGE"}
+    place = {**places, "mission": "POLICY"}.get(key)
     names = {name: place or name for name in value}
-    if key == "mission":
-        names = {n: n if n == "bytes_per_detection" else "POLICY" for n in value}
     parts = [keys(value[name], f"{key}.{named}".lstrip(".")) for name, named in names.items()]
     return set().union(*parts)
 
@@ -33,20 +31,19 @@ def keys(value, key=""):
 def test_a_real_summary_has_every_documented_key_and_no_other(smoke_run):
     found = keys(json.loads((smoke_run / "summary.json").read_text()))
     found.discard("commit")  # known in a checkout
-    assert found == KEYS - RARE - OF_ALL_NAIVE
+    assert found == KEYS - RARE
     # What tests of the page and the terminal show is a summary too.
     assert keys(SUMMARY) == {key for key in found if ".intervals." not in key}
 
 
 def test_every_rare_key_is_somewhere():
-    of_naive = dict.fromkeys(("observations_per_poi", "time_s", "mean_time_s"), 0.5)
-    alone = {**CASE, "seed": 7, "of_naive": of_naive, "told": 1.0, "ambiguous_reported": None}
-    evaluation = {**EVALUATION, "mission": {"camera_alone": alone, "bytes_per_detection": BYTES}}
+    alone = {**CASE, "seed": 7, "told": 1.0, "ambiguous_reported": None}
+    evaluation = {**EVALUATION, "mission": {"camera_alone": alone}}
     found = keys(OF_SEEDS) | keys(OF_A_TEAM) | keys(OF_SCANS)
     found |= {"commit", "origins"} | {
         key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)
     }
-    assert RARE | OF_ALL_NAIVE <= found <= KEYS
+    assert RARE <= found <= KEYS
 
 
 @pytest.mark.parametrize(

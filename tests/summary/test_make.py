@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from summaries import FOUND
 
-from jaxsense import mission
 from jaxsense.config import PRESETS, Config, JmvaeConfig
 from jaxsense.config.learning import EvaluationConfig
 from jaxsense.config.scene import ArenaConfig
@@ -13,25 +13,6 @@ from jaxsense.training.comparison import permutations
 
 CONFIG = PRESETS["smoke"]
 RETURNS = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal"
-
-FOUND = {
-    "classes": np.array([[0, 1, 2], [2, 2, 1]]),
-    "is_right": np.array([[True, True, False], [True, True, True]]),
-    "ambiguous": np.array([[False, True, False], [True, True, False]]),
-    # The third PoI of the second mission was never detected: .9, .8, .4, .7 and 1 count.
-    "seen": np.array([[True, True, True], [True, True, False]]),
-    "confidence": np.array([[0.9, 0.8, 0.4], [0.7, 1.0, 0.2]]),
-    "nll": np.array([[0.1, 0.2, 1.5], [0.3, 0.0, 9.0]]),
-    "told": {"camera": np.array([2 / 3, 1.0]), "lidar": np.array([1 / 3, 2 / 3])},
-    "observations_per_poi": np.array([1.0, 2.0]),
-    "time_s": np.array([10.0, 20.0]),
-    "collisions": np.array([0, 2]),
-    "goals": np.array([4, 6]),
-    "goals_reached": np.array([4, 5]),
-    "information": np.array([5.0, 6.0]),
-    "detections": np.array([[2, 3], [2, 3]]),
-    "reason": np.array([1, 2]),
-}
 
 
 def test_more_than_nine_of_ten_looks_make_a_class_unambiguous():
@@ -132,21 +113,9 @@ def test_summary_of_a_case_as_worked_by_hand():
     assert make.case(CONFIG, "camera_alone", FOUND)["ambiguous_reported"] == pytest.approx(3 / 5)
 
 
-def test_bytes_of_a_detection_as_worked_by_hand():
-    # Two float32 for each of two latent dimensions; 640 pixels of 3 bytes, 683 beams of 4.
-    size = make.traffic(mission.make_mission(CONFIG), np.array([1, 3]))
-    assert (size["latent"], size["features"]) == (16, 8)
-    assert size["raw"] == pytest.approx((1 * 1920 + 3 * 2732) / 4)
-    # Without any detection, the mean of both.
-    assert make.traffic(mission.make_mission(CONFIG), np.zeros(2))["raw"] == (1920 + 2732) / 2
-
-
 def test_policies_are_compared_with_the_latent_one_arena_by_arena():
     found = {**FOUND, "time_s": np.array([12.0, 22.0])}
-    block = make.missions(mission.make_mission(CONFIG), {"latent": FOUND, "naive": found})
-    assert set(block) == {"latent", "naive", "bytes_per_detection"}
+    block = make.missions(CONFIG, {"latent": FOUND, "naive": found})
+    assert set(block) == {"latent", "naive"}
     assert "intervals" not in block["latent"]
     assert block["naive"]["intervals"]["time_s"] == {"mean": 2.0, "low": 2.0, "high": 2.0}
-    # Ten looks of the camera and six of the LiDAR, of both cases.
-    raw = (8 * 1920 + 12 * 2732) / 20
-    assert block["bytes_per_detection"]["raw"] == pytest.approx(raw)

@@ -10,8 +10,8 @@ from jax.tree_util import Partial
 
 import jaxsense
 from jaxsense import tasks
-from jaxsense.tasks.environment import CLIP, Scaling
 from jaxsense.tasks.score import _play_compiled
+from jaxsense.tasks.task import CLIP, Scaling
 
 make = functools.cache(jaxsense.make)
 

@@ -11,8 +11,8 @@ import pytest
 import jaxsense
 from benchmarks import ship
 from jaxsense import tasks
-from jaxsense.core.types import Belief
-from jaxsense.tasks import pretrained
+from jaxsense.core.types import Belief, placed
+from jaxsense.tasks import registry
 
 
 def with_sizes_of(config, other):
@@ -79,8 +79,8 @@ def test_what_was_written_is_read_again(tmp_path):
     tree = {"beliefs": (Belief(jnp.arange(3.0), jnp.ones(3)), [jnp.int32(7)]), "none": ()}
     config, made = jaxsense.PRESETS["smoke"], tasks.origin("default")
     ship.write(tmp_path / "a.npz", {"tree": tree}, config, made)
-    arrays, *about = pretrained.read(tmp_path / "a.npz")
+    arrays, *about = registry.read(tmp_path / "a.npz")
     assert about == [config, made]
-    chex.assert_trees_all_equal(pretrained.fill(arrays, "tree", tree), tree)
+    chex.assert_trees_all_equal(placed({"tree": tree}, arrays)["tree"], tree)
     with pytest.raises(ValueError, match="tree/x is missing"):
-        pretrained.fill(arrays, "tree", {"x": jnp.zeros(2)})
+        placed({"tree": {"x": jnp.zeros(2)}}, arrays)

@@ -101,6 +101,9 @@ def test_the_interval_is_of_the_interquartile_mean():
     found = estimate(np.array([3.0, 100.0, 1.0, 2.0]))
     assert found.value == 2.5
     assert 1 <= found.low < 2.5 < found.high <= 100
+    # Of ten, a resample's differs from theirs by one and more.
+    many = estimate(np.arange(10.0))
+    assert many.low < many.value - 1 < many.value + 1 < many.high
     assert estimate(np.array([4.0])) == tasks.Estimate(4.0, 4.0, 4.0)
 
 
@@ -132,6 +135,11 @@ def test_a_score_of_one_seed_shows_no_interval():
         "  optimal: 1.000",
         "  naive: 0.250",
     ]
+    # Where no optimum is known, the best rule takes its place.
+    rules = {"nearest": np.array([0.25]), "auction": np.array([0.75])}
+    team = tasks.Score("team-v0", "team", returns, rules, False)
+    assert (team.best, team.fraction_of_optimal.value) == ("auction", pytest.approx(2 / 3))
+    assert str(team).splitlines()[1] == "  fraction of the best rule, auction: 0.667"
     two = {name: np.repeat(found, 2) for name, found in references.items()}
     shown = str(tasks.Score(NAME, "camera", np.repeat(returns, 2), two, True)).splitlines()
     assert shown[0] == f"{NAME}, camera, 2 seeds: return 0.500 (0.500 to 0.500)"

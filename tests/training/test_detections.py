@@ -6,10 +6,10 @@ from typing import Any, cast
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, TINY, stage_of
+from tiny import KEY, TINY, given_problem, stage_of
 
 from jaxsense.core import supervised
-from jaxsense.training.surveys import Survey, Surveys
+from jaxsense.training.detections import Survey, Surveys
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Looks
 
@@ -23,7 +23,7 @@ def given_to_detectors(windows, labels):
     of_both, distances = (windows[:, None],) * 2, jnp.ones((number, 2, 1))
     survey = Survey(classes, scenes, of_both, distances)
     others = Survey(classes, scenes, tuple(200 + x for x in of_both), distances)
-    return {"surveys": Surveys(survey, others), "examples": (NOTHING, NOTHING)}
+    return {"surveys": Surveys(survey, others, others, others), "examples": (NOTHING, NOTHING)}
 
 
 @pytest.mark.parametrize(("share", "trained_on"), [(0.0, 10), (0.25, 7)])
@@ -49,6 +49,7 @@ def test_looks_that_calibrate_a_detector_are_not_trained_on(share, trained_on, m
         return "fitted"
 
     monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "problem", given_problem)
     monkeypatch.setattr(detectors, "calibrate", calibrate)
     monkeypatch.setattr(detectors, "fitted", fitted)
     stage = stage_of("detector_lidar", config)

@@ -36,7 +36,7 @@ def found():
 
 def test_figures_of_the_latent_space_as_worked_by_hand(found):
     _, figures = found
-    assert figures.active_units == 2
+    assert figures["active_units"] == 2
     norms = {
         "joint": [3**0.5, 3**0.5, 3],  # 1 + 1 + 1; 4 + 4 + 1
         "camera": [3**0.5, 27**0.5, 27**0.5],  # 1 + 25 + 1
@@ -44,12 +44,12 @@ def test_figures_of_the_latent_space_as_worked_by_hand(found):
         "lidar": [(28**0.5 + (26**0.5 + 2) ** 0.5) / 2, 28**0.5, 6**0.5],
     }
     for name, expected in norms.items():
-        np.testing.assert_allclose(figures.sigma_norm[name], expected, rtol=1e-5)
+        np.testing.assert_allclose(figures["sigma_norm"][name], expected, rtol=1e-5)
     # At most 2 deviations away. At the second look at class 0, (2.5, 0) is 7.5 / 2.26 deviations
     # from class 0 and 2.5 / 2.26 from class 1, the only one that it leaves open.
     shares = {"joint": [1, 1, 1], "camera": [1, 0, 0], "lidar": [0, 0, 1]}
     for name, expected in shares.items():
-        np.testing.assert_array_equal(figures.unambiguous[name], expected)
+        np.testing.assert_array_equal(figures["unambiguous"][name], expected)
 
 
 def test_what_a_look_leaves_open_is_as_worked_by_hand(found):
@@ -57,7 +57,7 @@ def test_what_a_look_leaves_open_is_as_worked_by_hand(found):
     # 5 / sqrt(26); only the second look at class 0 leaves too few.
     shares = {"joint": [1, 1, 1], "camera": [1, 1, 1], "lidar": [0.5, 1, 1]}
     for name, expected in shares.items():
-        np.testing.assert_array_equal(found[1].consistent[name], expected)
+        np.testing.assert_array_equal(found[1]["consistent"][name], expected)
 
 
 def test_beliefs_of_classes_are_means_over_the_bank_that_is_given():
@@ -81,11 +81,11 @@ def test_fusion_as_worked_by_hand(found):
     # The LiDAR's look after the camera's is exact. The camera's after the LiDAR's is encoded with a
     # cube of .6 more, and so lies 6 further along the second dimension: class 1 at (0, 6) is nearer
     # to class 2 at (0, 10), class 2 lies 6 / 2 deviations off.
-    np.testing.assert_allclose(found[1].fusion["accuracy"], 5 / 6, rtol=1e-6)
-    np.testing.assert_allclose(found[1].fusion["mean_error"], (6 + 6 + 3) / 6, rtol=1e-4)
+    np.testing.assert_allclose(found[1]["fusion"]["accuracy"], 5 / 6, rtol=1e-6)
+    np.testing.assert_allclose(found[1]["fusion"]["mean_error"], (6 + 6 + 3) / 6, rtol=1e-4)
     # A cube of .6 more also widens two of three dimensions, by 4^(.6 / 2), after one of two orders.
     widening = 0.6 * np.log(2.0) * 2 / 3
-    np.testing.assert_allclose(found[1].fusion["std_error"], widening / 2, rtol=1e-4)
+    np.testing.assert_allclose(found[1]["fusion"]["std_error"], widening / 2, rtol=1e-4)
 
 
 @jax.jit
@@ -134,6 +134,8 @@ def test_exact_bayes_reads_the_same_looks():
     error = 4 * np.sqrt(share * (1 - share) / 600) * np.log(2)
     assert np.all(np.abs(found["bayes_nll"] - share * np.log(2)) < error)
     assert np.all(np.diff(found["bayes_nll"]) <= 1e-6)
+    # Where two classes are left, the belief is wider.
+    assert found["doubt_correlation"] > 0.5
 
 
 def test_moment_matching_error_as_worked_by_hand():

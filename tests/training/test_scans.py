@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import inputs_of, learn_by_stages
+from tiny import given_problem, inputs_of, learn_by_stages
 
 from jaxsense import PRESETS, Config, looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
@@ -16,10 +16,9 @@ from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
 from jaxsense.models import make_scan_jmvae
 from jaxsense.training import scans
-from jaxsense.training.detections import Shown, repeated
+from jaxsense.training.detections import Shown, draw_scenes, num_scenes, repeated
 from jaxsense.training.stage import Stage
-from jaxsense.training.surveys import draw_scenes, num_scenes
-from jaxsense.vae import leave_one_out
+from jaxsense.vae import detectors, leave_one_out
 
 SMOKE = PRESETS["smoke"]
 TINY = dataclasses.replace(
@@ -112,10 +111,8 @@ def test_looks_for_training_are_sorted_by_what_all_looks_show(learned, monkeypat
     outputs = learned.outputs
     num_bank = num_scenes(TINY)[1]
     shown = jnp.arange(num_bank * TINY.arena.num_pois).reshape(num_bank, -1) % 3
-    monkeypatch.setattr(looks, "features", lambda trained, windows, distances: tuple(
-        jnp.concatenate([shown, jnp.full((len(w) - num_bank, TINY.arena.num_pois), 9)])[..., None]
-        for w in windows
-    ))  # fmt: skip
+    features = lambda trained, windows, distances: (shown[..., None],) * len(windows)  # noqa: E731
+    monkeypatch.setattr(looks, "features", features)
     taken_for = Shown(outputs["shown"].calibrating, bank=shown)
     untrained = {"detector_camera": (), "detector_lidar": ()}
     found = begun("detections", {**outputs, **untrained, "shown": taken_for})
@@ -147,7 +144,7 @@ def test_what_all_looks_show_is_the_class_nearest_to_their_posterior(learned):
     assert shown.bank.shape == (num_bank, 3)
     assert shown.calibrating.shape == (12, 3)
     for scene, poi in ((0, 0), (4, 2), (8, 1)):
-        for found, survey in ((shown.bank, surveys.others), (shown.calibrating, calibrating)):
+        for found, survey in ((shown.bank, surveys.bank), (shown.calibrating, calibrating)):
             expected = plain(survey, scene, poi)
             np.testing.assert_array_equal(found[scene : scene + 4, poi], expected)
 
@@ -171,6 +168,7 @@ def test_encoders_are_calibrated_with_looks_that_nothing_learned_from(learned, m
     used = []
     monkeypatch.setattr(leave_one_out, "calibrate", calibrate)
     monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "problem", given_problem)
     inputs = inputs_of(stage.name, TINY, outputs)
     state = stage.begin(KEY, TINY, **inputs)
     state, _ = stage.advance(KEY, TINY, state, **inputs)

@@ -9,6 +9,7 @@ from tiny import KEY, TINY
 
 from jaxsense import training
 from jaxsense.run import pipeline
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs
@@ -20,7 +21,8 @@ def test_learn_and_a_run_come_to_the_same(monkeypatch, tmp_path):
     monkeypatch.setattr(Programs, "_compile_missions", lambda programs: None)
     config = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
     monitor = Monitor()
-    with pipeline.compiled(config, monitor) as programs:
+    with Compiler(monitor) as compiler:
+        programs = Programs(config, compiler)
         found = pipeline.train(KEY, config, programs, monitor, Checkpoints(tmp_path))
     # A few steps, after which rounding has not yet made learning part ways.
     learned = jax.jit(lambda key: learn(key, config))(KEY)

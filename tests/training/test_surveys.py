@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import KEY, SMOKE, stage_of
+from tiny import KEY, SMOKE, given_problem, stage_of
 
 from jaxsense import looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
-from jaxsense.training.surveys import Survey, num_scenes
+from jaxsense.training.detections import Survey, num_scenes
 from jaxsense.vae import detectors
 
 
@@ -65,6 +65,7 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
 
     listed = {stage.name: stage for stage in training.stages.stages(MEASURED)}
     monkeypatch.setattr(supervised, "fit", fit)
+    monkeypatch.setattr(detectors, "problem", given_problem)
     monkeypatch.setattr(detectors, "features", lambda detector, window, distance: window)
     divided = listed["survey"].finish(MEASURED, surveys)
     examples = jax.jit(listed["examples"].begin)(KEY, MEASURED, surveys=divided)

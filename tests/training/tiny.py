@@ -1,6 +1,7 @@
 """The smallest training that has every stage."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,11 @@ TINY = dataclasses.replace(
     ),
     mission=MissionConfig(episodes=1, time_limit=0.5),
 )  # fmt: skip
+
+
+def given_problem(config, detector, shown, labels, nothing):
+    """In place of `detectors.problem`: what a detector is fitted to."""
+    return SimpleNamespace(shown=shown, labels=labels, nothing=nothing)
 
 
 def sources_of(config):

@@ -2,6 +2,7 @@
 
 import functools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -41,14 +42,15 @@ def problem():
     nothing, _ = some_looks(jax.random.key(2), 500, False)
     init = lambda windows: detectors.init(KEY, windows, 2, CONFIG, measures_distance=True)  # noqa: E731
     untrained = jax.jit(init)(shown.windows)
-    return detectors.Fitting(CONFIG, untrained, shown, labels, nothing)
+    fit = detectors.problem(CONFIG, untrained, shown, labels, nothing)
+    return SimpleNamespace(detector=untrained, shown=shown, nothing=nothing, fit=fit)
 
 
 @pytest.fixture(scope="module")
 def trained(problem):
     """A detector, and the losses of its training."""
     start = supervised.start(problem.detector.params, CONFIG)
-    fit = jax.jit(lambda key, state: supervised.fit(key, state, problem, CONFIG.steps))
+    fit = jax.jit(lambda key, state: supervised.fit(key, state, problem.fit, CONFIG.steps))
     state, losses = fit(jax.random.key(2), start)
     found = replace(problem.detector, params=state.params)
     return jax.jit(detectors.fitted)(found, problem.shown, problem.nothing), losses
@@ -94,7 +96,7 @@ def test_the_loss_is_the_mean_cross_entropy_of_both_kinds_of_looks():
     # Labels as likely as one another; the log-odds that a PoI is there are its distance.
     detector = linear([[0, 0, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 0])
     looks = lambda *at: Looks(jnp.zeros((len(at), 1)), jnp.array(at))  # noqa: E731
-    problem = detectors.Fitting(CONFIG, detector, looks(2.0, 0.5), jnp.array([0, 1]), looks(1.0))
+    problem = detectors.problem(CONFIG, detector, looks(2.0, 0.5), jnp.array([0, 1]), looks(1.0))
     drawn = jnp.array([0, 1]), jnp.array([0])
     # -log sigmoid(2) = .126928, -log sigmoid(.5) = .474077, log 2 for the label; and
     # -log(1 - sigmoid(1)) = 1.313262.

@@ -9,40 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exact_filter import LABELS, PRIOR, exact_filter, untrained_filter
 
 from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
-from jaxsense.core.types import Belief
 from jaxsense.vae import fusion
-from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.readout import Bayes
 
-# Red or green, cylinder or cube: classes are green cylinder, red cylinder, red cube.
-MODEL = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
-LABELS = np.array([[1, 0, 0], [0, 0, 1]])
-CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-PRIOR = fusion.prior(MODEL, 20.0)
 NOBODY = np.zeros(2, bool)
-
-
-def untrained(hidden=(1,)):
-    init = lambda key: fusion.init_filter(key, MODEL, CLASSES, PRIOR, hidden)  # noqa: E731
-    return jax.jit(init)(jax.random.key(0))
-
-
-@functools.cache
-def exact():
-    """A filter whose log-likelihoods are the logarithm of the label's feature."""
-    found = untrained()
-    # With three classes in two dimensions, every log-likelihood is linear in the moments.
-    of_moments = np.linalg.pinv(found.readout.of_classes)
-    networks = {
-        name: {"params": {"Dense_0": {"kernel": np.eye(2)[:, labels] @ of_moments.T}}}
-        for name, labels in zip(MODEL.modalities, LABELS, strict=True)
-    }
-    for network in networks.values():
-        network["params"]["Dense_0"]["bias"] = np.zeros(2)
-    return dataclasses.replace(found, networks=jax.tree.map(jnp.float32, networks), hidden=())
 
 
 @functools.partial(jax.jit, static_argnums=3)
@@ -67,7 +41,7 @@ def bank(key, size):
 
 
 def test_looks_by_hand():
-    found = exact()
+    found = exact_filter()
     read = jax.jit(found.class_probabilities)
     red = update(found, PRIOR, [0.8, 0.2], 0)
     # .2 / 3 to .8 / 3 to .8 / 3.
@@ -83,7 +57,7 @@ def test_looks_by_hand():
 
 
 def test_looks_come_to_the_same_in_any_order_and_together():
-    found = exact()
+    found = exact_filter()
     looks = [(0, [0.7, 0.3]), (1, [0.4, 0.6]), (1, [0.8, 0.2]), (0, [0.9, 0.1])]
 
     def after(order):
@@ -107,8 +81,8 @@ TRAINED = FilterConfig(steps=600)
 @pytest.fixture(scope="module")
 def trained():
     """A filter after two chunks of half its training, and all losses."""
-    found = untrained((16,))
-    problem = fusion.Filtering(TRAINED, found, bank(jax.random.key(2), 4000))
+    found = untrained_filter((16,))
+    problem = fusion.filtering(TRAINED, found, bank(jax.random.key(2), 4000))
     train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
     state, losses = supervised.start(found.networks, TRAINED), []
     for i in range(2):

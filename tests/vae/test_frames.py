@@ -37,6 +37,12 @@ def test_a_cylinder_has_the_depth_of_a_circle():
     np.testing.assert_allclose(found, found[::-1], atol=2e-3)
 
 
+def test_a_profile_is_not_mirrored():
+    found = np.asarray(PROFILE(jnp.where(ANGLES > 0, 0.5, 0.55)))  # 5 cm deeper to the right
+    left, right = (found[(x > 0.02) & (x < 0.08)].mean() for x in (PLACES, -PLACES))
+    assert right - left == pytest.approx(0.05, abs=0.005)
+
+
 @pytest.mark.parametrize(("distance", "bearing"), [(0.4, 0.0), (0.8, 0.1), (1.1, -0.1)])
 def test_distance_and_bearing_are_taken_out(distance, bearing):
     usual, found = PROFILE(cylinder(0.5, 0.0)), PROFILE(cylinder(distance, bearing))

@@ -1,11 +1,11 @@
 """Fusion in place: which encoder is asked, and with what; and what every kind of fusion has."""
 
-import functools
 import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from exact_filter import CLASSES
 from plain import decode, encode, looks, random_params
 
 from jaxsense.config import JmvaeConfig
@@ -47,22 +47,15 @@ def test_every_update_encodes_the_look_with_what_the_map_says_of_the_others():
             assert_same(belief, encode(params, model, tuple(inputs)))
 
 
-def test_several_sensors_may_look_at_once():
-    # What has looked before and does not look now is decoded; all the others are as they are.
-    params = random_params(jmvae.init, THREE)
-    camera, _, sonar = looks(THREE)
-    fuse = jax.jit(functools.partial(fusion.fuse, params, THREE))
-    generated = decode(params, THREE, OLD.mean)
-    for has_lidar in (False, True):
-        belief = fuse(OLD, np.array([True, has_lidar, False]), (camera, None, sonar))
-        lidar = generated[1] if has_lidar else None
-        assert_same(belief, encode(params, THREE, (camera, lidar, sonar)))
+def test_looks_add_up_in_a_filter_alone():
+    assert fusion.Filter.accumulates
+    assert not fusion.InPlace.accumulates
 
 
 def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
     params, shown = random_params(jmvae.init, TWO), looks(TWO)
     config = JmvaeConfig(reconstruction_weights=(2.0, 0.5))
-    problem = fusion.Decoding(config, tuple(x[None, None] for x in shown), TWO, params)
+    problem = fusion.decoding(config, tuple(x[None, None] for x in shown), TWO, params)
     drawn = jnp.zeros((2, 1)), tuple(x[:, None] for x in shown)
     found = jax.jit(problem.loss)(params["decoders"], drawn, jnp.int32(0))
     expected = 0.0
@@ -71,9 +64,6 @@ def test_the_loss_of_decoding_is_the_error_at_the_mean_of_every_posterior():
         for weight, x, read in zip((2.0, 0.5), given, decoded, strict=True):
             expected += 0.0 if x is None else 0.5 * weight * np.sum((x - read) ** 2)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
 
 
 def test_in_place_the_class_shown_is_not_one_that_the_belief_rules_out():

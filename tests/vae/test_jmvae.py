@@ -52,14 +52,6 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     np.testing.assert_allclose(parts["subsets"], [expected], rtol=1e-5)
 
 
-def test_first_half_of_an_encoders_output_is_the_mean_and_the_second_the_log_variance():
-    params = with_output(zero_parameters(TWO), "lidar", [1.0, 2.0, jnp.log(4.0), 0.0])
-    features = keep(looks(TWO), (1,))
-    belief = jmvae.posterior(params, TWO, features)
-    np.testing.assert_allclose(belief.mean, [1.0, 2.0])
-    np.testing.assert_allclose(belief.std, [2.0, 1.0], rtol=1e-6)  # exp(ln(4) / 2) = 2
-
-
 def test_beta_falls_by_equal_factors_to_its_last_value():
     config = JmvaeConfig(steps=100, annealing=0.5, initial_beta=1.0, beta=0.01)
     betas = [float(jmvae.annealed_beta(jnp.int32(s), config)) for s in (0, 25, 50, 99)]
@@ -78,7 +70,7 @@ LIDAR = np.tile(CLASSES + ROWS, (1, 1, 2))
 
 @pytest.fixture(scope="module")
 def drawn():
-    return jmvae.Fitting(
+    return jmvae.problem(
         SETTINGS, (CAMERA, LIDAR), Jmvae(("camera", "lidar"), (1, 2), 2, (3,))
     ).draw(jax.random.key(0), 20)
 
@@ -100,6 +92,18 @@ def test_a_pair_is_of_one_class_and_otherwise_independent(drawn):
     pairs = set(zip((camera % 10).ravel().tolist(), (first % 10).ravel().tolist(), strict=True))
     assert len(pairs) == 3 * 5
     assert not np.array_equal(camera[0], camera[1])
+
+
+@pytest.mark.parametrize("steps", [1, 150])
+def test_a_training_takes_as_many_steps_as_it_is_told(steps):
+    bank = tuple(jnp.eye(2)[jnp.array(x)][:, None] for x in ([1, 0, 0], [0, 0, 1]))
+    config = JmvaeConfig(steps=steps, batch=16, learning_rate=0.01, annealing=0.0)
+    train = jax.jit(jmvae.train, static_argnums=2)
+    params, found = train(jax.random.key(0), random_params(jmvae.init, TWO), TWO, bank, config)
+    assert found.shape == (steps,)
+    assert np.isfinite(found).all()
+    assert steps == 1 or found[-9:].mean() < 0.9 * found[:9].mean()
+    assert jax.tree.structure(params) == jax.tree.structure(random_params(jmvae.init, TWO))
 
 
 # The loss, term by term, against the equation written down anew.
@@ -176,9 +180,3 @@ def test_linear_decoders_have_a_likelihood_in_closed_form(params, present):
     features = tuple(x if m in present else None for m, x in enumerate(FEATURES))
     found = estimate(jax.random.key(1), params, LINEAR, features, WEIGHTS, samples=20_000)
     np.testing.assert_allclose(found, exact(params, present), atol=0.03)
-
-
-def test_a_bank_without_looks_is_refused():
-    empty = tuple(np.zeros((3, 0, 2), np.float32) for _ in TWO.modalities)
-    with pytest.raises(ValueError, match="rows in the bank of camera = 0"):
-        jmvae.train(jax.random.key(0), {}, TWO, empty, SETTINGS)

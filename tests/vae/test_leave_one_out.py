@@ -122,7 +122,7 @@ def test_alpha_sets_in_late():
     config = JmvaeConfig(
         learns_from="scans", fusion="filter", hidden=(4,), steps=100, alpha=3.0, annealing=0.0,
     )  # fmt: skip
-    problem = leave_one_out.Fitting(config, LOOKS, MODEL)
+    problem = leave_one_out.problem(config, LOOKS, MODEL)
     rows, noise = problem.draw(KEY, 1)
     drawn, loss = (rows[0], noise[0]), jax.jit(problem.loss)
     early, start, late, end = (
@@ -155,6 +155,7 @@ def encoder_of(sharpness=1.0) -> Encoder:
 def test_features_are_probabilities_of_labels_read_from_the_posterior():
     encoder = encoder_of()
     assert encoder.num_labels == 2
+    assert not encoder.presence.measures_distance  # unless it is told so
     left = features(encoder, jnp.array([-1.0]))
     np.testing.assert_allclose(left.sum(), 1.0, rtol=1e-6)
     assert left[0] > 0.99
@@ -179,6 +180,16 @@ def test_a_point_belongs_to_the_nearest_centre():
     centres = jnp.array([[0.0, 0.0], [4.0, 0.0]])
     points = jnp.array([[1.9, 5.0], [2.1, -5.0], [4.0, 0.0]])
     np.testing.assert_array_equal(leave_one_out.nearest(points, centres), [0, 1, 1])
+
+
+def test_the_centres_of_several_tries_are_those_nearest_to_the_points():
+    # Nine clusters of ten points each, of which a single try misses some.
+    places = np.array([[x, y] for x in (0.0, 4.0, 8.0) for y in (0.0, 1.0, 9.0)])
+    points = np.repeat(places, 10, axis=0) + 0.1 * RNG.normal(size=(90, 2))
+    found = jax.jit(leave_one_out.centres, static_argnums=2)(KEY, jnp.float32(points), 9)
+    means = points.reshape(9, 10, 2).mean(axis=1)
+    apart = np.linalg.norm(means[:, None] - np.asarray(found)[None], axis=-1)
+    np.testing.assert_allclose(apart.min(axis=1), 0.0, atol=1e-3)
 
 
 def test_no_two_classes_are_one_cluster():

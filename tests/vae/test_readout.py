@@ -6,14 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exact_filter import CLASSES, MODEL, PRIOR
 
 from jaxsense.core.types import Belief
 from jaxsense.vae import fusion, readout
-from jaxsense.vae.jmvae import Jmvae
 
-MODEL = Jmvae(("camera", "lidar"), (2, 2), 2, (4,))
-CLASSES = Belief(jnp.array([[1.2, 0.9], [-0.8, 0.9], [-0.8, -1.3]]), jnp.full((3, 2), 0.4))
-PRIOR = fusion.prior(MODEL, 20.0)
 READ = readout.make(CLASSES)
 
 

@@ -124,6 +124,7 @@ def test_the_order_of_colours_is_part_of_the_settings():
     turned = dataclasses.replace(OWN.arena, colours=dict(reversed(OWN.arena.colours.items())))
     assert turned.labels("colour") == OWN.arena.labels("colour")[::-1]
     assert turned != OWN.arena
+    assert turned.colours != OWN.arena.colours
     assert jax.tree.structure(turned) != jax.tree.structure(OWN.arena)
     assert dataclasses.replace(turned, colours=OWN.arena.colours) == OWN.arena
 

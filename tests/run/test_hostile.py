@@ -19,6 +19,7 @@ from untrained import blank
 import jaxsense
 from jaxsense import evaluate
 from jaxsense.config import PRESETS, ConfigError
+from jaxsense.core.types import by_place
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
 from jaxsense.summary import compare
@@ -124,7 +125,7 @@ def digested(name, content):
 
 def unfinished(**changed):
     """The training under way, of which some parts are others."""
-    return digested("unfinished/dqn_camera", TRAINING | changed)
+    return digested("unfinished/dqn_camera", by_place(TRAINING | changed))
 
 
 def edited(name, **changed):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsense.run.ledger import Ledger
+from jaxsense.run.missions import Ledger
 
 
 def test_missions_take_the_slots_of_those_that_are_done():

@@ -165,12 +165,15 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
     theirs = [tmp_path / "mine", kept.path / "mine", kept.path / f"stage-{32 * '0'}.stablehlo.txt"]
     for path in theirs:
         path.write_text("precious", encoding="utf-8")
+    left = kept.path / ".a.0123456789abcdef.unfinished"
+    left.write_text("{", encoding="utf-8")
     link = kept.path / f"stage-{32 * '1'}.stablehlo"
     link.symlink_to(theirs[0])
     monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
     assert all(path.exists() for path in (*theirs, link))
+    assert not left.exists()
 
 
 def test_the_source_is_that_of_the_whole_package(tmp_path):
@@ -202,6 +205,21 @@ def test_programs_of_custom_sensors_are_not_kept(tmp_path):
     kept = cli.keep_programs("train", tmp_path, config)
     assert kept is not None
     assert kept.path == tmp_path / "traced"
+
+
+def test_all_compiled_programs_are_cached(tmp_path):
+    entry = "jax_persistent_cache_min_"
+    names = [f"jax_compilation_cache_{what}" for what in ("dir", "max_size")]
+    names += [f"{entry}compile_time_secs", f"{entry}entry_size_bytes"]
+    before = [jax.config.values[name] for name in names]
+    try:
+        jax.config.update(names[0], None)
+        compilation.use_cache(tmp_path)
+        found = [jax.config.values[name] for name in names]
+    finally:
+        for name, value in zip(names, before, strict=True):
+            jax.config.update(name, value)
+    assert found == [str(tmp_path / "compiled"), compilation._MAX_BYTES, 0, -1]
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no users")

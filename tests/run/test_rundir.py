@@ -71,24 +71,6 @@ def test_a_line_that_a_killed_process_has_left_is_cut(tmp_path):
     assert [json.loads(line)["step"] for line in lines] == [1, 2]
 
 
-def test_steps_that_a_killed_process_has_reported_are_not_reported_again(tmp_path):
-    """It wrote steps 1 to 4, was killed, and its last checkpoint was of step 2."""
-    path = tmp_path / "run"
-    with RunDirectory.create(path, SETTINGS) as run:
-        for step in (1, 2, 3, 4):
-            run.append_metrics(stage="jmvae", step=step, loss=10.0 - step)
-        for step in (0, 0, 1):  # of missions, several reports may be alike
-            run.append_metrics(stage="mission", step=step)
-    with RunDirectory.resume(path) as run:
-        run.append_metrics(stage="dqn", step=1, loss=3.0)
-        for step in (3, 4, 5):
-            run.append_metrics(stage="jmvae", step=step, loss=10.0 - step)
-    lines = list(map(json.loads, (path / "metrics.jsonl").read_text("utf-8").splitlines()))
-    steps = {n: [x["step"] for x in lines if x["stage"] == n] for n in ("jmvae", "dqn", "mission")}
-    assert steps == {"jmvae": [1, 2, 3, 4, 5], "dqn": [1], "mission": [0, 0, 1]}
-    assert [x["loss"] for x in lines if "loss" in x] == [9, 8, 7, 6, 3, 5]
-
-
 @pytest.mark.parametrize("error", [ConfigError("a", 1, "is wrong"), KeyboardInterrupt()])
 def test_a_run_that_is_refused_before_it_begins_leaves_no_directory(tmp_path, error):
     def fail(path, *, begun):
@@ -172,7 +154,7 @@ def test_a_run_records_the_commit_of_its_source(tmp_path):
     assert version.commit(tmp_path) == head
     (tmp_path / "file").write_text("2")
     assert version.commit(tmp_path) == f"{head}-dirty"
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     with RunDirectory.create(tmp_path / "run", SETTINGS) as run:
         content = json.loads((run.path / "config.json").read_text("utf-8"))
     # Tests may run away from the source tree, and that without Git.

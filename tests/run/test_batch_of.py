@@ -9,7 +9,7 @@ import jaxsense
 from jaxsense import mission
 from jaxsense.config import PRESETS
 from jaxsense.config.mission import CommunicationConfig
-from jaxsense.run import devices, ledger
+from jaxsense.run import devices, missions
 from jaxsense.run.devices import Workers
 
 CONFIG = PRESETS["default"]
@@ -44,13 +44,13 @@ def bytes_of_state(config):
 
 
 def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
-    assert ledger.batch_of(CONFIG, 10_000) == 192
-    assert ledger.batch_of(CONFIG, 10_000, Workers(threads=2)) == 384
-    assert ledger.batch_of(CONFIG, 30, Workers(threads=2)) == 10
-    assert ledger.batch_of(CONFIG, 1) == 1
+    assert missions.batch_of(CONFIG, 10_000) == 192
+    assert missions.batch_of(CONFIG, 10_000, Workers(threads=2)) == 384
+    assert missions.batch_of(CONFIG, 30, Workers(threads=2)) == 10
+    assert missions.batch_of(CONFIG, 1) == 1
     # A roadmap of 60 PoIs takes 2.6 MB, of which 64 MiB hold 25.
     large = replace(MANY, arena=replace(MANY.arena, num_pois=60, side=20.0))
-    assert ledger.batch_of(large, 10_000) == 25
+    assert missions.batch_of(large, 10_000) == 25
 
 
 @pytest.mark.slow  # traces the start of large missions
@@ -62,10 +62,10 @@ def test_a_cpu_plays_what_its_caches_hold_and_at_most_a_third_at_once():
     ],
 )
 def test_what_is_counted_is_what_a_mission_takes(config):
-    assert ledger._bytes_of_state(config) == pytest.approx(bytes_of_state(config), rel=0.1)
+    assert missions._bytes_of_state(config) == pytest.approx(bytes_of_state(config), rel=0.1)
 
 
-OF_ONE = ledger._bytes_of_state(CONFIG)
+OF_ONE = missions._bytes_of_state(CONFIG)
 MESH = lambda: Workers(mesh=devices.make_mesh(2))  # noqa: E731
 
 
@@ -78,11 +78,11 @@ MESH = lambda: Workers(mesh=devices.make_mesh(2))  # noqa: E731
         (CONFIG, GIB // 2, 10**6, Workers, int(0.05 * GIB / 2) // OF_ONE),
         (CONFIG, 80 * GIB, 10**7, MESH, 65_536),
         (CONFIG, 80 * GIB, 32_768, MESH, 23_170),  # sqrt(8192 * 32,768 * 2)
-        (LARGEST, 2 * ledger._bytes_of_state(LARGEST), 10**6, Workers, 1),
+        (LARGEST, 2 * missions._bytes_of_state(LARGEST), 10**6, Workers, 1),
     ],
 )
 def test_an_accelerator_plays_what_pays_and_fits(
     config, memory, total, workers, expected, monkeypatch
 ):
     monkeypatch.setattr(devices, "memory", lambda: memory)
-    assert ledger.batch_of(config, total, workers()) == expected
+    assert missions.batch_of(config, total, workers()) == expected

@@ -4,12 +4,13 @@ import dataclasses
 import sys
 
 import pytest
+from smoke import error_line, written_run
 
 import jaxsense
 from jaxsense import evaluate, export, train
 from jaxsense.config import PRESETS, ConfigError, SensorConfig
 from jaxsense.run.rundir import RunDirectory
-from jaxsense.run.settings import Settings, read_settings, resumable
+from jaxsense.run.settings import read_settings, resumable
 
 REFUSED = (
     "sensors.thermal.make = 'trap:make': names code that would be run; "
@@ -37,9 +38,7 @@ def change(config):
 @pytest.fixture
 def run(tmp_path):
     """The directory of a run that names the trap."""
-    settings = Settings("smoke", 0, change(PRESETS["smoke"]))
-    with RunDirectory.create(tmp_path / "run", settings) as created:
-        return created.path
+    return written_run(tmp_path / "run", change(PRESETS["smoke"]))
 
 
 READERS = {
@@ -58,32 +57,27 @@ def test_a_run_that_names_code_is_refused(run, read):
         assert str(error.value) == REFUSED
 
 
-COMMANDS = {
-    "evaluate": lambda run, *more: evaluate.main([str(run), *more]),
-    "export": lambda run, *more: export.main([str(run), *more]),
-    "train --resume": lambda run, *more: train.main(["--resume", str(run), *more]),
-    "train --config": lambda run, *more: train.main(["--config", str(run / "config.json"), *more]),
-}
-
-
-@pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
-def test_commands_need_an_option(run, command, capsys):
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        (evaluate, ["RUN"]),
+        (export, ["RUN"]),
+        (train, ["--resume", "RUN"]),
+        (train, ["--config", "RUN/config.json"]),
+    ],
+)
+def test_commands_need_an_option(run, program, words, capsys):
+    argv = [word.replace("RUN", str(run)) for word in words]
     for more in ((), ("--no-trust",), ("--trust", "--no-trust")):
-        with pytest.raises(SystemExit) as stop:
-            command(run, *more)
-        assert stop.value.code == 2
-        told = capsys.readouterr()
-        assert REFUSED in told.err
-        assert (told.out, told.err.count("\n")) == ("", 1)
+        assert REFUSED in error_line([*argv, *more], capsys, program)
     with pytest.raises(SprungError):
-        command(run, "--trust")
+        program.main([*argv, "--trust"])
 
 
 def test_a_run_whose_reward_is_code_is_refused(tmp_path):
     smoke = PRESETS["smoke"]
     config = dataclasses.replace(smoke, mdp=dataclasses.replace(smoke.mdp, reward="trap:make"))
-    with RunDirectory.create(tmp_path / "run", Settings("smoke", 0, config)) as created:
-        path = created.path
+    path = written_run(tmp_path / "run", config)
     with pytest.raises(
         ConfigError, match=r"mdp\.reward = 'trap:make': names code that would be run"
     ):
@@ -99,13 +93,7 @@ def test_what_the_users_own_program_names_needs_none(run, tmp_path):
 
 
 def test_a_seed_of_several_must_have_the_settings_of_all(tmp_path, capsys):
-    settings = Settings("smoke", 3, PRESETS["smoke"], num_seeds=2)
-    with RunDirectory.create(tmp_path / "sweep", settings) as created:
-        path = created.path
-    of_seed = dataclasses.replace(settings, seed=3, num_seeds=1, config=change(settings.config))
-    with RunDirectory.create(path / "seed-3", of_seed):
-        pass
-    with pytest.raises(SystemExit) as stop:
-        train.main(["--resume", str(path), "--cache", "None", "--quiet"])
-    assert stop.value.code == 2
-    assert "must have the settings of" in capsys.readouterr().err
+    path = written_run(tmp_path / "sweep", PRESETS["smoke"], num_seeds=2)
+    written_run(path / "seed-0", change(PRESETS["smoke"]))
+    argv = ["--resume", str(path), "--cache", "None", "--quiet"]
+    assert "must have the settings of" in error_line(argv, capsys)

@@ -15,7 +15,7 @@ from smoke import without_times
 
 from jaxsense import train
 from jaxsense.config import ConfigError
-from jaxsense.run import processes
+from jaxsense.run import devices
 
 TRAIN = [sys.executable, "-m", "jaxsense.train", "--quiet", "--cache", "None"]
 
@@ -106,23 +106,42 @@ def test_two_processes_stop_and_resume_several_seeds(tmp_path):
 )
 def test_processes_that_cannot_be_are_named(given, expected, capsys):
     with pytest.raises(ConfigError, match=re.escape(expected)):
-        processes.join(*given)
+        devices.join(*given)
     assert capsys.readouterr().out == ""
 
 
 def test_who_waits_says_so_and_gives_up(monkeypatch, capsys):
-    monkeypatch.setattr(processes, "_JOIN_TIMEOUT", 0.5)
+    monkeypatch.setattr(devices, "_JOIN_TIMEOUT", 0.5)
     monkeypatch.setattr(jax.distributed, "initialize", lambda *_, **__: time.sleep(9))
     with pytest.raises(ConfigError, match="not all 2 processes have joined within"):
-        processes.join("localhost:1", 2, 0)
+        devices.join("localhost:1", 2, 0)
     assert capsys.readouterr().out == "Waiting for the other processes at localhost:1.\n"
+
+
+def test_the_first_process_listens_and_who_cannot_join_says_why(monkeypatch, capsys):
+    asked = []
+    note = lambda *given, **more: asked.append((*given, *more.values()))  # noqa: E731
+    monkeypatch.setattr(jax.distributed, "initialize", note)
+    devices.join("localhost:1", 1, 0, quiet=True)
+    devices.join("localhost:1", 2, 1)
+    timeout = 2 * devices._JOIN_TIMEOUT
+    assert asked[0] == ("localhost:1", 1, 0, "localhost:1", timeout)
+    assert asked[1] == ("localhost:1", 2, 1, None, timeout)
+    assert capsys.readouterr().out.count("Waiting") == 1
+
+    def fail(*_, **__):
+        raise RuntimeError("no such host\nat all")
+
+    monkeypatch.setattr(jax.distributed, "initialize", fail)
+    with pytest.raises(ConfigError, match=r"cannot be joined \(no such host\)$"):
+        devices.join("localhost:1", 2, 1, quiet=True)
 
 
 LISTENS = """
 import socket, sys
-from jaxsense.run import processes
+from jaxsense.run import devices
 port = int(sys.argv[1])
-processes.join(f"127.0.0.1:{port}", 1, 0, quiet=True)
+devices.join(f"127.0.0.1:{port}", 1, 0, quiet=True)
 socket.create_connection(("127.0.0.1", port), timeout=5).close()
 try:
     socket.create_connection(("127.0.0.2", port), timeout=5)
@@ -159,7 +178,7 @@ def test_ctrl_c_ends_a_process_that_waits_for_the_others(tmp_path):
 
 
 def test_the_first_process_checks_its_options_before_others_join(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(processes, "join", lambda *_, **__: pytest.fail("joined"))
+    monkeypatch.setattr(devices, "join", lambda *_, **__: pytest.fail("joined"))
     (tmp_path / "file").write_text("precious")
     shared = ["--coordinator", "localhost:1", "--num-processes", "2", "--process-index", "0"]
     for options, expected in (

@@ -103,7 +103,9 @@ def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):
     checkpoints = Checkpoints(tmp_path / "checkpoints")
-    assert checkpoints.load("tree", SHAPES) is None
+    assert checkpoints.load_or_forget("tree", SHAPES) is None
+    with pytest.raises(ConfigError, match=r"tree.msgpack': is missing"):
+        checkpoints.load("tree", SHAPES)
     checkpoints.save("tree", TREE)
     found = checkpoints.load("tree", SHAPES)
     assert jax.tree.structure(found) == jax.tree.structure(TREE)
@@ -170,5 +172,5 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     theirs.unlink()
     checkpoints.forget_unfinished(["jmvae"])
     assert not (tmp_path / "unfinished").exists()
-    assert checkpoints.load(name, state) is None
+    assert checkpoints.load_or_forget(name, state) is None
     assert checkpoints.load("tree", SHAPES) is not None

@@ -49,7 +49,7 @@ def learn(config):
     windows = jax.random.normal(keys[0], (12, 3))
     detector = detectors.init(keys[1], windows, 2, config.detector)
     looks = detectors.Looks(windows, jnp.ones(12))
-    problem = detectors.Fitting(config.detector, detector, looks, jnp.arange(12) % 2, looks)
+    problem = detectors.problem(config.detector, detector, looks, jnp.arange(12) % 2, looks)
     state = supervised.start(detector.params, config.detector)
     fit, _ = supervised.fit(keys[2], state, problem, config.detector.steps)
 

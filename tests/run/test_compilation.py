@@ -19,7 +19,7 @@ def test_compiling_and_running_are_timed_apart_and_reported():
     shape = program.compile(lambda x: 2 * x, jnp.float32(3))
     assert (shape.shape, shape.dtype) == ((), jnp.float32)
     assert program(jnp.float32(3)) == 6
-    timing = monitor.stopwatch.timing()
+    timing = monitor.timing()
     (seconds,) = timing["stages"].values()
     assert list(timing["stages"]) == ["stage"]
     assert 0 < seconds["run_s"] < seconds["compile_s"]

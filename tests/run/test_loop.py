@@ -15,6 +15,7 @@ import pytest
 
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, pipeline, programs
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.pipeline import run_chunks
@@ -56,8 +57,8 @@ def toy(replace_training, tmp_path):
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
         checkpoints = Checkpoints(path, warned.append)
-        with pipeline.compiled(SMOKE, monitor) as compiled:
-            found = pipeline.train(KEY, SMOKE, compiled, monitor, checkpoints)
+        with Compiler(monitor) as compiler:
+            found = pipeline.train(KEY, SMOKE, Programs(SMOKE, compiler), monitor, checkpoints)
         return found, [report for report in heard if report[2]], warned
 
     return train
@@ -94,6 +95,7 @@ def test_a_stage_reports_its_steps_and_none_beyond_the_last(toy):
     curves = found.curves["count"]
     np.testing.assert_array_equal(curves["double"], [2, np.nan, 6, 8, 10])
     assert len(curves["seconds"]) == 3
+    assert all(0 < seconds < 100 for seconds in curves["seconds"])
 
 
 def test_a_program_that_cannot_be_traced_ends_the_run_with_its_error(toy):
@@ -147,7 +149,8 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_tra
     kinds = [*(counting(name, shares="dqn") for name in names), counting("count")]
     replace_training(lambda drive: [drive(stage) for stage in kinds])
     monitor = Monitor()
-    with pipeline.compiled(SMOKE, monitor, trainings=2) as compiled:
+    with Compiler(monitor) as compiler:
+        compiled = Programs(SMOKE, compiler, trainings=2)
         shared = compiled.of(kinds[0])
         assert shared is compiled.of(kinds[1])
         every = [shared.advance, compiled.of(kinds[2]).finish]
@@ -282,6 +285,18 @@ def test_a_training_that_fails_keeps_what_was_sound(tmp_path):
     with pytest.raises(StageError, match="jmvae: loss = nan at step 3 of 4"):
         go_on(tmp_path, 4, run)
     check_saved(tmp_path, 4, done=2)
+
+
+def test_a_training_that_fails_says_if_it_could_not_be_kept(tmp_path, monkeypatch):
+    def run(chunk):
+        raise StageError("jmvae: loss = nan")
+
+    def save(*_):
+        raise OSError(28, "No space left")
+
+    monkeypatch.setattr(Checkpoints, "save", save)
+    with pytest.raises(StageError, match=r"loss = nan; cannot save the last .*No space left"):
+        go_on(tmp_path, 4, run)
 
 
 def test_a_killed_training_loses_no_more_than_a_minute(tmp_path, monkeypatch):
