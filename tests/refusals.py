@@ -21,7 +21,6 @@ FIELDS = [(name, f) for name, section in SECTIONS.items() for f in dataclasses.f
 PARTS = {
     **SECTIONS,
     "team.travel": SMOKE.team.travel,
-    "team.tours": SMOKE.team.tours,
     "mission.localisation": SMOKE.mission.localisation,
     "mission.communication": dataclasses.replace(SMOKE.mission.communication, own_maps=True),
 }

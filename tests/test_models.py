@@ -42,9 +42,8 @@ def test_before_training_no_class_is_known_and_no_look_has_a_value():
 
 def test_an_agent_is_that_of_its_task():
     one, team = models.make_agent(SMOKE), models.make_agent(TEAM)
-    assert (one.num_pois, one.useless, one.travel) == (3, 0.0, None)
-    # The reward of the paper for a look that tells nothing.
-    assert (team.num_pois, float(team.useless)) == (7, -1.0)
+    assert (one.num_pois, one.travel) == (3, None)
+    assert team.num_pois == 7
     assert team.travel.view_distance == TEAM.team.travel.view_distance
 
 

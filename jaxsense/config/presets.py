@@ -50,12 +50,16 @@ _SMOKE = Config(
     detector=DetectorConfig(num_scans=3072, num_held_out=1536, steps=300, batch=128),
     jmvae=JmvaeConfig(restarts=1, samples_per_class=512, steps=300, batch=128),
     dqn=DqnConfig(
+        task="map",
         hidden=(24, 24),
         num_envs=32,
         epochs=60,
         updates=64,
         batch=64,
         replay_capacity=2048,
+        discount=0.5,
+        epsilon_min=0.01,
+        target_period=50,
     ),
     evaluation=EvaluationConfig(
         num_starts=32,

@@ -351,7 +351,7 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     # A look under way continues while another robot looks.
     looked = jnp.maximum(state.looked + seconds - (times - mdp.travel.look_seconds), 0.0)
     looked = jnp.where(is_looker, 0.0, jnp.minimum(looked, mdp.travel.look_seconds))
-    moved = jax.vmap(mdp.travel.move, (0, 0, 0, None))(team.poses, goals, to_go, seconds)
+    moved = jax.vmap(mdp.travel.move, (0, 0, None, 0))(team.poses, goals, seconds, to_go)
     poi = jnp.where(passes, target[looker], nop)
     changed, reward = _look(key, mdp, state, poi, looker, moved[looker])
 

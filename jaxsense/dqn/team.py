@@ -111,7 +111,10 @@ class Steps:
     look_seconds = 1.0
 
     def seconds(
-        self, pose: Float[Array, "3"], place: Float[Array, "2"], to_go: Float[Array, ""]
+        self,
+        pose: Float[Array, "3"],
+        place: Float[Array, "2"],
+        to_go: Float[Array, ""] | float = 0.0,
     ) -> Float[Array, ""]:
         """One step."""
         del pose, place, to_go
@@ -126,11 +129,11 @@ class Steps:
         self,
         pose: Float[Array, "3"],
         place: Float[Array, "2"],
-        to_go: Float[Array, ""],
         seconds: Float[Array, ""],
+        to_go: Float[Array, ""] | float = 0.0,
     ) -> Float[Array, "3"]:
         """The pose, which stays."""
-        del place, to_go, seconds
+        del place, seconds, to_go
         return pose
 
 
@@ -151,7 +154,10 @@ class Travel:
     look_seconds: jax.Array | float = 0.7
 
     def seconds(
-        self, pose: Float[Array, "3"], place: Float[Array, "2"], to_go: Float[Array, ""]
+        self,
+        pose: Float[Array, "3"],
+        place: Float[Array, "2"],
+        to_go: Float[Array, ""] | float = 0.0,
     ) -> Float[Array, ""]:
         """Time until a robot has looked at a PoI.
 
@@ -172,8 +178,8 @@ class Travel:
         self,
         pose: Float[Array, "3"],
         place: Float[Array, "2"],
-        to_go: Float[Array, ""],
         seconds: Float[Array, ""],
+        to_go: Float[Array, ""] | float = 0.0,
     ) -> Float[Array, "3"]:
         """Pose of a robot some time after it set out for a PoI, see `seconds`."""
         turn, path = self._path(pose, place, to_go)
@@ -185,7 +191,7 @@ class Travel:
         return jnp.append(pose[:2] + driven * along, yaw)
 
     def _path(
-        self, pose: jax.Array, place: jax.Array, to_go: jax.Array
+        self, pose: jax.Array, place: jax.Array, to_go: jax.Array | float
     ) -> tuple[jax.Array, jax.Array]:
         """`[]` radians to turn and `[]` metres to drive until a robot looks, see `seconds`."""
         to_place = place - pose[:2]

@@ -160,14 +160,13 @@ def test_all_help_explains_every_field(capsys, monkeypatch):
     assert max(map(len, text.splitlines())) <= 80
     options = re.findall(r"^  (--\S+)", text, re.MULTILINE)
     assert {"--process-index", "--arena.side", "--dqn.epsilon-decay"} <= set(options)
-    assert "--mission.no-auctionsturnsitoff" in "".join(text.split())
     # Each option has a text.
     assert not re.search(r"^  --.*\n(?!      \S)", text, re.MULTILINE)
 
 
 def test_every_kind_of_option_is_read(tmp_path):
     words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
-        --mission.no-auctions --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
+        --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
         --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
         --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
     arguments = train.parse(words.split())
@@ -178,7 +177,6 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
     assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
     assert config.mdp.partly_seen_starts is True
-    assert config.mission == dataclasses.replace(smoke.mission, auctions=False)
     assert config.team == dataclasses.replace(
         smoke.team, travel=dataclasses.replace(smoke.team.travel, view_distance=0.3)
     )

@@ -63,7 +63,7 @@ def states():
 def values(params):
     """`[4, 3]` values in the states above."""
     agent = learning_in(MDP, PROBE).agent
-    observed = jax.vmap(lambda b: agent.observe(b, alone(2, 0), jnp.int32(0)))(states().belief)
+    observed = jax.vmap(lambda b: agent.observe(b, alone(2, 0), jnp.ones((1, 2)), jnp.int32(0)))(states().belief)
     return agent.values(params, observed.T).T
 
 

@@ -37,7 +37,7 @@ def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
     params = agent.init(KEY)["params"]
     bias = jnp.array([0.0, 1.0, 2.0, 9.0]).at[worst].set(jnp.nan)
     layers = {"params": {**params, "Dense_1": {**params["Dense_1"], "bias": bias}}}
-    latent = policy("latent", agent=agent, q_networks=(layers,) * 2, tours=(), fusion=MDP.fusion)
+    latent = policy("latent", agent=agent, q_networks=(layers,) * 2, fusion=MDP.fusion)
     told = []
 
     def act(key, known, memory):
@@ -54,6 +54,7 @@ def test_values_that_are_not_numbers_choose_no_action_and_total_nan(worst):
 
 
 CONFIG = DqnConfig(
+    task="map",
     hidden=(4,),
     num_envs=4,
     epochs=2,
@@ -79,7 +80,7 @@ class Shown(Certain):
 class Wide(Toy):
     """A look leaves as much doubt as it shows."""
 
-    def update(self, belief, seen, features, modality):
+    def update(self, belief, seen, features, modality, weight=1.0):
         return Belief(belief.mean, jnp.full(2, 1.0) * features)
 
 

@@ -1,5 +1,7 @@
 """The table of policies, on values worked by hand."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,10 +10,9 @@ from toys import known_of, policy
 
 from jaxsense.config import ConfigError
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import hybrid, optimum, policies
+from jaxsense.dqn import optimum, policies
 from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Policy
 from jaxsense.dqn.team import Team
 
 NOP, KEY, UNKNOWN = 3, jax.random.key(0), np.zeros((3, 3))
@@ -91,7 +92,7 @@ def test_random_takes_every_action_equally_often():
 
 
 def test_latent_takes_the_action_that_the_own_q_network_values_most():
-    agent = Agent(0.5, 0.0, 0.0, None, 3, 2, 2, (4,))
+    agent = Agent(0.5, 0.0, None, 3, 2, 2, (4,))
     layers = agent.init(KEY)["params"]
 
     def biased(best):
@@ -103,46 +104,34 @@ def test_latent_takes_the_action_that_the_own_q_network_values_most():
 
     for best in range(4):
         networks = biased(best), biased((best + 1) % 4)
-        models = {"agent": agent, "q_networks": networks, "tours": (), "fusion": Classes}
+        models = {"agent": agent, "q_networks": networks, "fusion": Classes}
         for modality in (0, 1):
             known = known_of(UNKNOWN, np.zeros((3, 2)), modality)
             assert policy("latent", **models)(KEY, known) == (best + modality) % 4
 
 
-@pytree
-class Widths(Agent):
-    """Values of looks at all PoIs are the sum of all widths, and that of NOP is 1."""
-
-    def values(self, params, observed):
-        width = observed.reshape(self.num_pois, 2, -1)[:, 1].sum()
-        return jnp.append(jnp.full(self.num_pois, width), 1.0)
-
-
-def test_a_look_is_worth_what_it_is_worth_alone():
-    agent = Widths(0.5, 0.0, 0.0, None, 3, 2, 1, (4,))
-    belief = Belief(jnp.zeros((3, 1)), jnp.array([[2.0], [4.0], [8.0]]))
-    # Classes of widths .25 and .75: each of the other two PoIs counts .5.
-    classes = Belief(jnp.zeros((2, 1)), jnp.array([[0.25], [0.75]]))
+def test_a_dense_network_is_shown_a_poi_that_was_given_up_as_of_the_nearest_class(monkeypatch):
+    agent = Agent(0.5, 0.0, None, 3, 2, 1, (4,))
+    monkeypatch.setattr(Agent, "values", lambda agent, params, observed: observed)
+    classes = Belief(jnp.array([[0.0], [4.0]]), jnp.array([[0.25], [0.75]]))
+    belief = Belief(jnp.array([[1.0], [3.0], [5.0]]), jnp.array([[2.0], [4.0], [8.0]]))
     known = known_of(UNKNOWN, np.zeros((3, 2)), belief=belief)
-    found = hybrid.worth(agent, None, classes, known)
-    np.testing.assert_allclose(found, [2 + 1 - 1, 4 + 1 - 1, 8 + 1 - 1])
-    # One that was given up is never worth a look.
     there = known.team.replace(present=jnp.array([True, False, True]))
-    found = hybrid.worth(agent, None, classes, known.replace(team=there))
-    np.testing.assert_allclose(found, [2, -np.inf, 8])
+    models = SimpleNamespace(
+        agent=agent, q_networks=(jnp.zeros(1),) * 2, fusion=SimpleNamespace(classes=classes)
+    )
+    found = policies.latent(KEY, models, known.replace(team=there))
+    np.testing.assert_allclose(found, [1, 2, 4, 0.75, 5, 8])
 
 
 def test_a_policy_of_ones_own_is_one_more_entry():
     def backwards(key, models, known):
         return jnp.append(jnp.arange(len(known.looks)), -1)
 
-    timed = Policy(backwards, lambda models: True)
-    table = policies.table({"backwards": backwards, "timed": timed})
-    assert [*table] == [*policies.POLICIES, "backwards", "timed"]
+    table = policies.table({"backwards": backwards})
+    assert [*table] == [*policies.POLICIES, "backwards"]
     known = known_of(UNKNOWN, np.zeros((3, 2)))
-    assert policies.best(table["backwards"].values(KEY, None, known)) == 2
-    assert not table["backwards"].counts_time(None)
-    assert table["timed"] is timed
+    assert policies.best(table["backwards"](KEY, None, known)) == 2
     with pytest.raises(ConfigError, match=r"^policies = 'greedy': must not be latent, "):
         policies.table({"greedy": backwards})
 

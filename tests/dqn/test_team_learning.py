@@ -53,22 +53,12 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     seen = jnp.zeros((9, 3)).at[2].set(jnp.array([0.2, 0.0, 0.4])).reshape(-1)
     after = jnp.array([8.0, 3.0, 16.0, 0.0])
     monkeypatch.setattr(Agent, "q", lambda agent, params, observed: params)
-    agent = Agent(0.5, 0.1, -1.0, TRAVEL, 3, 1, 1, (8,))
+    agent = Agent(0.5, 0.1, TRAVEL, 3, 1, 1, (8,))
     # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
     np.testing.assert_allclose(agent.values(after, seen), [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
     # The same for a batch in the last axis.
     both = agent.values(jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1))
     np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)
-
-
-AGENT = learning_in(TWO).agent
-
-
-def latent(params):
-    """The policy of the trained network alone, if every look pays."""
-    agent = replace(AGENT, useless=1e3)
-    models = {"agent": agent, "q_networks": (params,) * 2, "tours": (), "fusion": TWO.fusion}
-    return jax.jit(policy("latent", **models))
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +145,7 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
     def learned(seen):
         known = mdps.reset(jax.random.key(0), ALONE, jnp.zeros(2, int), seen).belief
         agent = learning_in(ALONE, PROBE).agent
-        x = agent.observe(known, alone(2, 0), jnp.int32(0))
+        x = agent.observe(known, alone(2, 0), jnp.ones((1, 2)), jnp.int32(0))
         return agent.q(state.params, x)
 
     np.testing.assert_allclose(learned(ONCE_SEEN), ONCE_Q, atol=0.1)

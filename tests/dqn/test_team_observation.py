@@ -33,7 +33,10 @@ def team_of_three(**changed):
     return replace(team, **changed)
 
 
-observe = jax.jit(lambda team, agent, belief=BELIEF: surroundings(TRAVEL, belief, team, agent, 2))
+@jax.jit
+def observe(team, agent, belief=BELIEF):
+    times = TRAVEL.times(team, jnp.zeros(team.heads.shape))
+    return surroundings(belief, team, times, agent, 2)
 
 
 def test_what_a_robot_knows_as_worked_by_hand():

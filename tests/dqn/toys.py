@@ -63,7 +63,7 @@ class Toy:
 class Counting(Toy):
     """The more modalities have looked, the better a PoI is known."""
 
-    def update(self, belief, seen, features, modality):
+    def update(self, belief, seen, features, modality, weight=1.0):
         number = jnp.sum(jnp.asarray(seen).at[modality].set(True))
         return Belief(features, jnp.array([[3.0, 4.0], [0.6, 0.8], [0.3, 0.4]])[number - 1])
 
@@ -72,7 +72,7 @@ class Counting(Toy):
 class Adding(Toy):
     """A look adds to the information what it shows."""
 
-    def update(self, belief, seen, features, modality):
+    def update(self, belief, seen, features, modality, weight=1.0):
         return Belief(features, 1.0 / (1.0 / belief.std + features))
 
 
@@ -80,7 +80,7 @@ class Adding(Toy):
 class Once(Toy):
     """Every look writes the same."""
 
-    def update(self, belief, seen, features, modality):
+    def update(self, belief, seen, features, modality, weight=1.0):
         return Belief(jnp.array([1.0, 0.0]), jnp.array([0.6, 0.8]))
 
 
@@ -114,7 +114,7 @@ def known_of(log_posterior, looks, modality=0, belief=None):
 
 def policy(name, **models):
     """`(key, known) -> action` of a policy in the table, by what it reads of models."""
-    values = policies.POLICIES[name].values
+    values = {**policies.POLICIES, **policies.UNORDERED}[name]
     return lambda key, known: policies.best(values(key, SimpleNamespace(**models), known))
 
 
@@ -136,10 +136,10 @@ def classes_mdp(num_pois=3, num_modalities=2, **config):
 
 
 def agent_of(mdp, hidden, discount=0.5, second_cost=0.0):
-    """An agent of an MDP, for which a look that tells nothing costs 1."""
+    """An agent of an MDP."""
     travel = None if mdp.teams is None else mdp.teams.travel
     sizes = mdp.num_pois, mdp.num_modalities, mdp.fusion.prior.mean.size
-    return Agent(discount, second_cost, -1.0, travel, *sizes, hidden)
+    return Agent(discount, second_cost, travel, *sizes, hidden)
 
 
 def team_mdp_of(mapped, places, travel=TRAVEL, robots=None, max_steps=300, **given):

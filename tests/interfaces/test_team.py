@@ -54,7 +54,7 @@ def test_the_whole_team_starts_and_is_never_alone(robots):
 def test_every_step_equals_the_mdps(robots):
     mdp = robots.played.mdp
     mdp_step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
-    observe = jax.jit(lambda s, r: surroundings(mdp.travel, s.belief, s.team, r, 2))
+    observe = jax.jit(lambda s, r: surroundings(s.belief, s.team, mdp.times(s), r, 2))
     state = expected = reset(jax.random.key(3), robots)
     turns, looks = [], 0
     for i in range(11):

@@ -51,22 +51,12 @@ def as_numpy():
     return lambda tree: jax.tree.map(np.asarray, tree)
 
 
-_RULES = {"auctions": False}
-
-
 @pytest.fixture(scope="session")
 def decides(team, as_numpy):
-    """The state after a decision of robot 0, by models and by rules of coordination."""
-
-    def choose(key, models, state, rules):
-        changed = replace(CONFIG, mission=replace(CONFIG.mission, **rules))
-        return decide_alone(key, with_config(team, changed), models, state, 0)
-
-    jitted = jax.jit(choose)
+    """The state after a decision of robot 0, by models."""
+    jitted = jax.jit(lambda models, state: decide_alone(jax.random.key(0), team, models, state, 0))
     # JAX would compile another program for weakly typed numbers.
-    return lambda models, state, **rules: jitted(
-        jax.random.key(0), as_numpy(models), state, {**_RULES, **rules}
-    )
+    return lambda models, state: jitted(as_numpy(models), state)
 
 
 @pytest.fixture(scope="session")

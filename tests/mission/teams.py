@@ -14,9 +14,9 @@ from jaxsense.mission.state import no_faults
 from jaxsense.sim.light import Light
 from jaxsense.vae import detectors, readout
 
-# Untrained detectors are never sure; what they say is of no importance here. Robots follow values.
-_FOLLOWING = replace(PRESETS["smoke"].mission, least_confidence=0.0, auctions=False)
-CONFIG = replace(PRESETS["smoke"], mission=_FOLLOWING)
+# Untrained detectors are never sure; what they say is of no importance here.
+_UNSURE = replace(PRESETS["smoke"].mission, least_confidence=0.0)
+CONFIG = replace(PRESETS["smoke"], mission=_UNSURE)
 POLICIES = tuple(dqn.POLICIES)
 LATENT, NAIVE = POLICIES.index("latent"), POLICIES.index("naive")
 # The robot is 1.0, 0.8 and 1.6 m from PoIs 0, 1 and 2.

@@ -9,7 +9,6 @@ from teams import CONFIG
 
 import jaxsense
 from jaxsense import mission
-from jaxsense.dqn.policies import Policy
 from jaxsense.run import score
 
 
@@ -87,9 +86,8 @@ def test_differences_are_of_the_same_arenas(play):
 
 @pytest.mark.parametrize("values", [jnp.zeros(3), jnp.zeros(4, int), 0.0])
 def test_a_policy_without_a_value_for_each_action_is_named(values):
-    checked = score._checked("mine", Policy(lambda key, models, known: values, is_unordered=True))
-    assert checked.is_unordered
+    checked = score._checked("mine", lambda key, models, known: values)
     with pytest.raises(
         ValueError, match=r"^policies\['mine'\] = <lambda>: must return floats of shape \[4\]"
     ):
-        checked.values(None, None, SimpleNamespace(looks=np.zeros((3, 2))))
+        checked(None, None, SimpleNamespace(looks=np.zeros((3, 2))))

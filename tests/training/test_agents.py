@@ -1,4 +1,4 @@
-"""Stages of agents: the values of looks, Q-learning and tours."""
+"""Stages of agents: the values of looks, and Q-learning."""
 
 import dataclasses
 from types import SimpleNamespace
