@@ -11,8 +11,6 @@ from typing import get_args
 import beartype
 import jaxtyping
 
-from jaxsense.vae.gaussian import kl_divergence
-
 _CONFIG = beartype.BeartypeConf(is_pep484_tower=True)  # an int is a float
 CHECKED = set[str]()
 """Names of the functions whose arrays are checked."""
@@ -46,6 +44,7 @@ def main() -> None:
 
     import jaxsense
     from jaxsense import mission
+    from jaxsense.vae.gaussian import kl_divergence
 
     team = dataclasses.replace(
         TINY,

@@ -16,7 +16,7 @@ from jaxsense.core.types import Belief, Index, others, pytree
 from jaxsense.dqn.policies import Values, table
 from jaxsense.mission.maps import Memory, OwnMap, SharedMap
 from jaxsense.mission.roadmap import Roadmap
-from jaxsense.sim import arena as arenas_of
+from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors
 from jaxsense.sim import world as worlds
 from jaxsense.sim.arena import Arena
@@ -263,23 +263,16 @@ def make_mission(
     policies: Mapping[str, Values] | None = None,
     *,
     contacts: bool = True,
-    arenas: tuple[Arena, Arena] | None = None,
 ) -> Mission:
     """Makes the mission that `config` describes.
 
     Args:
       config: all settings; numbers that are declared `Traced` may be traced.
-      arenas: `world.arena` and `free_arena` of a mission with the same sizes, to reuse; by default
-        they are compiled, which cannot be traced.
-
-    Raises:
-      ValueError: if `arenas` were compiled from other settings than `config.arena`.
     """
-    arena, free = (None, None) if arenas is None else arenas
+    on_top = sensors.on_top(config, config.carried)
     return Mission(
-        world=worlds.make_world(config, config.carried, arena=arena, contacts=contacts),
-        free_arena=free
-        or arenas_of.build(config.arena, sensors.on_top(config, config.carried), obstacles=False),
+        world=worlds.make_world(config, config.carried, contacts=contacts),
+        free_arena=arenas.build(config.arena, on_top, obstacles=False),
         config=config,
         policies=FrozenDict(table(policies)),
     )

@@ -353,9 +353,7 @@ def _whole(chunks: list[Recording]) -> Recording:
 
 def _with_numbers(mission: Mission, config: Config) -> Mission:
     """The mission with traced settings."""
-    arenas = mission.world.arena, mission.free_arena
-    made = make_mission(config, arenas=arenas)
-    return dataclasses.replace(made, policies=mission.policies)
+    return dataclasses.replace(make_mission(config), policies=mission.policies)
 
 
 def _begin(

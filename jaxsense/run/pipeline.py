@@ -173,7 +173,7 @@ def train(
             running.add(threads.submit(training.run, stage, inputs, output))
             return output
 
-        stages.train(drive, config, programs.arena)
+        stages.train(drive, config)
         kept = {name: x for name, x in outputs.items() if name not in _ONLY_PASSED_ON}
         outputs.clear()
         for _ in as_completed(running):

@@ -20,7 +20,6 @@ from jaxsense.dqn.policies import Values
 from jaxsense.run import missions
 from jaxsense.run.compilation import Compiler, Program, RowProgram
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.sim.world import make_world
 from jaxsense.training import stages
 from jaxsense.training.stage import Output, Stage
 
@@ -84,8 +83,7 @@ class Programs:
           trainings: number after whose last call a program is released; 0 for never.
           policies: of missions, by name, in addition to `dqn.POLICIES`.
         """
-        self.config, self.arena = config, make_world(config).arena
-        self.stages = stages.stages(config, self.arena)
+        self.config, self.stages = config, stages.stages(config)
         self.player: Future[missions.Player] = Future()
         self._compiler, self._workers, self._policies = compiler, workers, policies
         names = [stage.program for stage in self.stages]
@@ -116,7 +114,7 @@ class Programs:
             return self._compile(stage, inputs)
 
         try:
-            stages.train(drive, self.config, self.arena)
+            stages.train(drive, self.config)
             if not left:
                 self._compile_missions()
         except BaseException as error:

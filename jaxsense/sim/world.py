@@ -60,7 +60,6 @@ def make_world(
     config: Config,
     robots: tuple[str, ...] | None = None,
     *,
-    arena: arenas.Arena | None = None,
     contacts: bool = False,
 ) -> World:
     """Makes the simulation that `config` describes.
@@ -69,20 +68,14 @@ def make_world(
       config: all settings; numbers that are declared `Traced` may be traced.
       robots: modality of each robot; by default one robot per modality, in the order of
         `config.modalities`, as training needs.
-      arena: a compiled arena to reuse, with which this function can be traced; `robots` and
-        `contacts` are ignored. By default, the arena is compiled.
       contacts: whether robots collide, see `arena.build`.
 
     Raises:
-      ValueError: if `arena` was compiled from other settings than `config.arena`.
       ConfigError: if a custom sensor is wrong, see `sensors.make`, or JAX computes in 64 bits.
     """
     require_32_bits()
-    if arena is None:
-        on_top = sensors.on_top(config, robots or config.modalities)
-        arena = arenas.build(config.arena, on_top, contacts=contacts)
-    elif arena.config != config.arena:
-        raise ValueError("arena: must be compiled from config.arena; its settings differ")
+    on_top = sensors.on_top(config, robots or config.modalities)
+    arena = arenas.build(config.arena, on_top, contacts=contacts)
     errors = config.mission.localisation
     localised = errors if errors.in_training else None
     return World(arena, sensors.make(config), config.viewpoint, localised)

@@ -116,7 +116,7 @@ def _environment(
 ) -> Environment:
     """What an agent learns in."""
     is_live = config.dqn.observe == "live"
-    looks = Live(make_world(config, arena=arena), detectors) if is_live else Bank(detections.bank)
+    looks = Live(make_world(config), detectors) if is_live else Bank(detections.bank)
     mdp = make_mdp(config, models_of(config, fusion), looks)
     return Environment(make_agent(config), mdp.of(modality) if mdp.teams is None else mdp)
 

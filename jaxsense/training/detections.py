@@ -19,7 +19,6 @@ from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.models import make_bayes, make_detector
 from jaxsense.sim import sensors
-from jaxsense.sim.arena import Arena
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import Scene, make_world
 from jaxsense.training.stage import Fit, Output, Stage, fit_stage
@@ -141,14 +140,14 @@ def draw_scenes(key: Key, config: Config) -> Scenes:
     return jax.random.split(scene_key, total), classes, is_empty, places
 
 
-def survey(key: Key, config: Config, *, arena: Arena, scenes: Scenes) -> Survey:
+def survey(key: Key, config: Config, *, scenes: Scenes) -> Survey:
     """Surveys all scenes together: compiling takes longer than running.
 
     It may get a part of the scenes, and knows nothing of their number.
     """
     del key
     keys, classes, is_empty, places = scenes
-    world = make_world(config, arena=arena)
+    world = make_world(config)
     seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
     return Survey(classes, seen, windows, distances)
 
@@ -331,7 +330,6 @@ def learn_novelty(
     key: Key,
     config: Config,
     *,
-    arena: Arena,
     trained: tuple[Detector, ...],
     scenes: Scenes,
     shown: Shown | None = None,
@@ -340,7 +338,7 @@ def learn_novelty(
     number = config.detector.num_repeats
     if not number:
         return novelty.independent(len(trained))
-    world, exact = make_world(config, arena=arena), make_bayes(config)
+    world, exact = make_world(config), make_bayes(config)
     class_key, *keys = jax.random.split(key, 1 + len(trained))
     classes, places, taken_for = repeated(class_key, config, scenes, shown)
 

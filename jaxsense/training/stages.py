@@ -5,7 +5,6 @@
 and stops if asked to.
 """
 
-import functools
 from collections.abc import Mapping
 
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.models import Models, make_models
-from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans
 from jaxsense.training.stage import (
@@ -45,22 +43,21 @@ class Learned:
     is_finite: Bool[Array, ""]
 
 
-def train(drive: Drive, config: Config, arena: Arena) -> None:
+def train(drive: Drive, config: Config) -> None:
     """The training. Outputs pass through `drive` alone, so that it may return anything for them.
 
     Args:
       drive: executes each stage, and keeps what is needed of its output.
       config: all settings; its static fields determine the stages and all sizes.
-      arena: from `sim.make_world(config)`.
     """
     scenes = drive(Stage("scenes", detections.draw_scenes))
-    survey = functools.partial(detections.survey, arena=arena)
-    surveyed = drive(Stage("survey", survey, finish=detections.divide), scenes=scenes)
+    survey = Stage("survey", detections.survey, finish=detections.divide)
+    surveyed = drive(survey, scenes=scenes)
     examples = drive(Stage("examples", detections.looks_at_nothing), surveys=surveyed)
     perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
     learned = perceive(drive, config, surveys=surveyed, examples=examples)
     detectors, params, classes, detected, shown = learned
-    novelty = Stage("novelty", functools.partial(detections.learn_novelty, arena=arena))
+    novelty = Stage("novelty", detections.learn_novelty)
     drive(novelty, trained=detectors, scenes=scenes, **shown)
     known = {"detections": detected}
     drive(Stage("detector_metrics", measures.detector_metrics), **known)
@@ -77,6 +74,7 @@ def train(drive: Drive, config: Config, arena: Arena) -> None:
     values = drive(solve, classes=classes, detections=detected)
     drive(Stage("beliefs", measures.beliefs), **known)
 
+    arena = make_world(config).arena
     networks = agents.train(drive, config, arena, detectors=detectors, look_values=values, **known)
     for m, name in enumerate(config.modalities):
         network = networks[agents.learner(config, name)]
@@ -125,27 +123,23 @@ def _learn_from_scans(
     return trained, params, classes, detected, {"shown": shown}
 
 
-def stages(config: Config, arena: Arena | None = None) -> list[Stage]:
+def stages(config: Config) -> list[Stage]:
     """The stages of a training, in the order of `train`."""
     found: list[Stage] = []
-    train(lambda stage, **_: found.append(stage), config, _arena(config, arena))
+    train(lambda stage, **_: found.append(stage), config)
     return found
 
 
 @checks.typed
-def learn(
-    key: Key, config: Config, arena: Arena | None = None, *, until: str | None = None
-) -> Learned:
+def learn(key: Key, config: Config, *, until: str | None = None) -> Learned:
     """Runs the whole training as one pure function.
 
     Args:
       key: the only source of randomness.
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
-      arena: from `sim.make_world(config)`; compiled anew by default.
       until: name of the last stage; all stages by default.
     """
-    arena = _arena(config, arena)
-    names = [stage.name for stage in stages(config, arena)]
+    names = [stage.name for stage in stages(config)]
     if until is not None and until not in names:
         raise ValueError(f"until = {until!r}: must be one of {', '.join(names)}")
     outputs, progress, finite = dict[str, Output](), dict[str, Progress](), [jnp.bool_(True)]
@@ -161,12 +155,8 @@ def learn(
             finite.append(is_finite((outputs[stage.name], losses)))
         return outputs[stage.name]
 
-    train(drive, config, arena)
+    train(drive, config)
     return Learned(outputs, progress, jnp.stack(finite).all())
-
-
-def _arena(config: Config, arena: Arena | None) -> Arena:
-    return make_world(config).arena if arena is None else arena
 
 
 def models(outputs: Mapping[str, Output], config: Config) -> Models:

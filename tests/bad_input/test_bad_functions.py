@@ -44,7 +44,7 @@ class World:
         self.params, self.model = self.models.jmvae, jaxsense.make_jmvae(SMOKE)
         self.world = sim.make_world(SMOKE)
         self.camera, self.lidar = self.world.sensors
-        self.mission = mission.make_mission(SMOKE, arenas=(self.world.arena,) * 2)
+        self.mission = mission.make_mission(SMOKE)
         self.classes = jnp.array([0, 1, 2])
         layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
         light = random_light(self.key)
@@ -346,10 +346,6 @@ FUNCTIONS = [
     (lambda w: sim.look(w.key, w.world, w.scene, 2, 0), "robot = 2: must be one of the 2 robots"),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, -2), "robot = -2: must be -1 or one of"),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, 2), "robot = 2: must be -1 or one of"),
-    (
-        lambda w: sim.make_world(changed("arena", side=4.0), arena=w.world.arena),
-        "arena: must be compiled",
-    ),
     (lambda w: survey(0, w.world, w.classes), "key = 0: must be one key"),
     (lambda w: random_light(0), "key = 0: must be one key"),
     (lambda w: Light(w.x, 1.0, 1.0).changes(), "conditions = None"),

@@ -28,8 +28,7 @@ AHEAD = [[0.8, 0.0], [-1.0, 1.0], [-1.0, -1.0]]
 
 def with_config(team, config):
     """The same mission with other numbers, which may be traced."""
-    arenas = team.world.arena, team.free_arena
-    return mission.make_mission(config, team.policies, arenas=arenas)
+    return mission.make_mission(config, team.policies)
 
 
 def starting(team, models):

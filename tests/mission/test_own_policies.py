@@ -39,8 +39,8 @@ OWN = {"mine": last_first, "close": close, "lost": lost}
 
 
 @pytest.fixture(scope="module")
-def own(team):
-    return mission.make_mission(CONFIG, OWN, arenas=(team.world.arena, team.free_arena))
+def own():
+    return mission.make_mission(CONFIG, OWN)
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
 def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
     played = lambda mission, compiler, total, workers: mission  # noqa: E731
     monkeypatch.setattr(programs.missions, "Player", played)
-    monkeypatch.setattr(programs.stages, "train", lambda drive, config, arena: None)
+    monkeypatch.setattr(programs.stages, "train", lambda drive, config: None)
     made = programs.Programs(playing("mine"), Compiler(Monitor()), policies=OWN)
     assert [*made.player.result().policies] == ["mine"]
     with pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"):

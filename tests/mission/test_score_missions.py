@@ -8,7 +8,6 @@ import pytest
 from teams import CONFIG
 
 import jaxsense
-from jaxsense import mission
 from jaxsense.run import score
 
 
@@ -54,10 +53,7 @@ def play(team, models, monkeypatch):
             asked["played"] = {name: case.policy for name, case in played.items()}
             return SimpleNamespace(metrics={name: FOUND[name] for name in played})
 
-    made = mission.make_mission
-    arenas = team.world.arena, team.free_arena
     monkeypatch.setattr(score.missions, "Player", Player)
-    monkeypatch.setattr(score, "make_mission", lambda *args: made(*args, arenas=arenas))
 
     def run(policies, **options):
         return jaxsense.score_missions(CONFIG, models, policies, **options), asked

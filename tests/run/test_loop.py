@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from jaxsense.config import PRESETS
-from jaxsense.run import devices, pipeline, programs
+from jaxsense.run import devices, pipeline
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -38,10 +38,9 @@ def collect():
 def replace_training(monkeypatch):
     """Replaces the training of a run by some calls of `drive`, without missions."""
     monkeypatch.setattr(Programs, "_compile_missions", lambda programs: None)
-    monkeypatch.setattr(programs, "make_world", lambda config: SimpleNamespace(arena=None))
 
     def replace(toy_training):
-        train = lambda drive, config, arena: toy_training(drive)  # noqa: E731
+        train = lambda drive, config: toy_training(drive)  # noqa: E731
         monkeypatch.setattr(stages, "train", train)
 
     return replace

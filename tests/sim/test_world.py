@@ -91,6 +91,11 @@ def test_the_first_free_viewpoint_is_taken_or_that_with_the_most_room(monkeypatc
     assert pose[0] == pytest.approx(float(rooms[0][first if is_first else most] + above), rel=1e-5)
 
 
+@pytest.mark.parametrize("side", [1.0, 20.0])
+def test_what_is_away_is_outside_of_the_walls(side):
+    assert np.max(np.abs(viewpoints.outside(ArenaConfig(side=side, num_pois=1)))) > side
+
+
 @jax.jit
 def free_room(x, y, clearance, layout, others, poi):
     return viewpoints.free_room(x, y, clearance, ArenaConfig(), layout, others, poi)

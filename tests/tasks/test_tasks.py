@@ -82,7 +82,8 @@ def test_stored_returns_of_references_are_what_they_reach(name, agent, row):
 @pytest.mark.parametrize("agent", ["camera", "team"])
 def test_a_task_is_printed_as_it_is_made(agent):
     name = "team-v0" if agent == "team" else "map-v0"
-    assert repr(jaxsense.make(name, agent)) == f"jaxsense.make('{name}', '{agent}')"
+    for task in (jaxsense.make(name, agent), jaxsense.make(name)):  # by default the first
+        assert repr(task) == f"jaxsense.make('{name}', '{agent}')"
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def test_optional_stages_may_diverge_and_no_others(is_optional, wrong, monkeypat
     losses = [1.0, 2.0, np.nan if wrong == "loss" else 3.0, 4.0, 5.0, 6.0]
     output = np.inf if wrong == "output" else 0.0
 
-    def train(drive, config, arena):
+    def train(drive, config):
         drive(Stage("before", begin(1)))
         drive(steps_of("s", losses, is_optional=is_optional, output=output))
         drive(Stage("after", begin(2)))

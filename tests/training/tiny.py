@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jaxsense import training
 from jaxsense.config import PRESETS, DetectorConfig, JmvaeConfig
 from jaxsense.config.mission import MissionConfig
-from jaxsense.sim.world import make_world
 from jaxsense.training.stage import is_finite, scan
 
 SMOKE, KEY = PRESETS["smoke"], jax.random.key(7)
@@ -38,7 +37,7 @@ def sources_of(config):
         found[stage.name] = inputs
         return stage.name
 
-    training.stages.train(drive, config, make_world(config).arena)
+    training.stages.train(drive, config)
     return found
 
 
@@ -59,7 +58,7 @@ def learn_by_stages(key, config, until):
         finite.append(is_finite(outputs[stage.name]))
         return outputs[stage.name]
 
-    training.stages.train(drive, config, make_world(config).arena)
+    training.stages.train(drive, config)
     return training.stages.Learned(outputs, {}, jnp.stack(finite).all())
 
 
