@@ -139,7 +139,9 @@ def scaling_of(key: jax.Array, task: Task) -> Scaling:
             chances = task.action_mask(state).at[-1].set(False)
             action = jax.random.choice(choice_key, len(chances), p=chances / chances.sum())
             after, _ = task.step(step_key, state, action)
-            return after, task.mdp.features(state.belief, state.team, state.agent)
+            return after, task.mdp.features(
+                state.belief, state.team, task.mdp.times(state), state.agent
+            )
 
         return jax.lax.scan(look, state, jax.random.split(walk_key, _STEPS))[1]
 

@@ -78,7 +78,8 @@ class Examiner:
 
         def learned(params: optax.Params, known: Known, classes: jax.Array) -> jax.Array:
             del classes
-            return agent.values(params, agent.observe(known.belief, known.team, known.robot))
+            observed = agent.observe(known.belief, known.team, known.times, known.robot)
+            return agent.values(params, observed)
 
         def mean_return(
             values: Callable[[Known, jax.Array], jax.Array], starts: Start

@@ -138,26 +138,22 @@ def train_chunk(
     config: DqnConfig,
     state: DqnState,
     prepared: Underway,
-    evaluation: Callable[[Key], Evaluate] | None = None,
+    evaluate: Evaluate | None = None,
 ) -> tuple[DqnState, EpochInfo]:
     """Trains for `config.chunk` epochs.
 
     Args:
       prepared: `[num_starts]` from `starts`. Each environment has a share of them, and starts every
         episode from a random one of its share.
-      evaluation: prepares for the chunk what is called after every tenth epoch, or after the last
-        if ten do not divide the chunk.
+      evaluate: called after every tenth epoch, or after the last if ten do not divide the chunk.
     """
     chex.assert_tree_shape_prefix(prepared, (config.num_starts,))
     shares = jax.tree.map(lambda x: x.reshape(config.num_envs, -1, *x.shape[1:]), prepared)
     *draw_keys, evaluation_key = jax.random.split(key, 4)
     draws = _draw(draw_keys, config)
     epoch = functools.partial(_epoch, environment, config, shares)
-    if evaluation is None:
+    if evaluate is None:
         return jax.lax.scan(epoch, state, draws)
-    # Once a chunk: a start simulates all earlier looks, an episode only a few.
-    start_key, evaluation_key = jax.random.split(evaluation_key)
-    evaluate = evaluation(start_key)
     every = _EVALUATED if config.chunk % _EVALUATED == 0 else config.chunk
 
     def advance(state: DqnState, of_group: tuple[Key, _Draws]) -> tuple[DqnState, EpochInfo]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +11,17 @@ from jaxtyping import Array, Int
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Fusion, Key
+from jaxsense.core.types import Belief, Fusion, Key, Novelty
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Environment, Underway
+from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.team import alone
 from jaxsense.dqn.training import DqnState
 from jaxsense.looks import Bank, Live, make_mdp
 from jaxsense.models import make_agent, make_bayes, make_prior
-from jaxsense.sim.arena import Arena
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
 from jaxsense.training.comparison import held_out_mdp, models_of
@@ -78,85 +79,93 @@ def look_values(
 def train(
     drive: Drive,
     config: Config,
-    arena: Arena,
     *,
-    look_values: Output,
     detections: Output,
     fusion: Output,
     detectors: tuple[Output, ...],
+    novelty: Output,
 ) -> dict[str, Output]:
     """Trains the Q-networks, returned by the names of their stages."""
-    given = {"detections": detections, "fusion": fusion, "detectors": detectors}
-    starts = drive(Stage("starts", functools.partial(_starts, arena)), **given)
+    given = {"fusion": fusion, "detectors": detectors, "novelty": novelty}
+    starts = drive(Stage("starts", _starts), detections=detections, **given)
     networks: dict[str, Output] = {}
     for m, name in enumerate(config.modalities):
         # A team's one network is evaluated with the first sensor.
         if (network := learner(config, name)) not in networks:
             stage = Stage(
                 network,
-                functools.partial(_begin, arena),
-                functools.partial(_advance, arena),
+                _begin,
+                _advance,
                 _params,
                 steps=config.dqn.epochs,
                 chunks=config.dqn.epochs // config.dqn.chunk,
                 shares="dqn",
             )
-            networks[network] = drive(stage, modality=jnp.int32(m), starts=starts, **given)
+            of_sensor = {"modality": jnp.int32(m), "starts": starts, "detections": detections}
+            networks[network] = drive(stage, **of_sensor, **given)
     return networks
 
 
 def _environment(
-    arena: Arena,
     config: Config,
     modality: Int[Array, ""],
-    *,
     detections: Detections,
+    *,
     fusion: Fusion,
     detectors: tuple[Detector, ...],
+    novelty: Novelty,
 ) -> Environment:
     """What an agent learns in."""
     is_live = config.dqn.observe == "live"
     looks = Live(make_world(config), detectors) if is_live else Bank(detections.bank)
-    mdp = make_mdp(config, models_of(config, fusion), looks)
+    models = dataclasses.replace(models_of(config, fusion), novelty=novelty)
+    mdp = make_mdp(config, models, looks)
     return Environment(make_agent(config), mdp.of(modality) if mdp.teams is None else mdp)
 
 
 def _starts(
-    arena: Arena, key: Key, config: Config, *, detections: Detections, **inputs: Output
-) -> Output:
-    """First states of episodes, `[num_starts]`."""
-    learning = _environment(arena, config, jnp.int32(0), detections=detections, **inputs)
-    if not detections.starts.classes.shape[0]:
-        return dqn.starts(key, learning, config.dqn)
-    return _surveyed_starts(key, learning, detections.starts, config.dqn.num_starts)
+    key: Key, config: Config, *, detections: Detections, **given: Any
+) -> tuple[Underway, Start]:
+    """First states of episodes, `[num_starts]` to learn from, and those of all evaluations."""
+    learn_key, held_out_key = jax.random.split(key)
+    learning = _environment(config, jnp.int32(0), detections, **given)
+    held_out = held_out_mdp(config, given["fusion"], detections, jnp.int32(0))
+    surveyed, number = detections.starts, config.dqn.num_starts
+    begun = (
+        _surveyed_starts(learn_key, learning, surveyed, number)
+        if len(surveyed.classes)
+        else dqn.starts(learn_key, learning, config.dqn)
+    )
+    return begun, comparison.evaluation_starts(held_out_key, held_out, config)
 
 
 def _begin(
-    arena: Arena,
     key: Key,
     config: Config,
     *,
     modality: Int[Array, ""],
-    starts: Output,
-    **inputs: Output,
+    starts: tuple[Underway, Start],
+    detections: Detections,
+    **given: Any,
 ) -> DqnState:
-    return dqn.init(key, _environment(arena, config, modality, **inputs), config.dqn, starts)
+    learning = _environment(config, modality, detections, **given)
+    return dqn.init(key, learning, config.dqn, starts[0])
 
 
 def _advance(
-    arena: Arena,
     key: Key,
     config: Config,
     state: DqnState,
     *,
     modality: Int[Array, ""],
-    starts: Output,
-    **inputs: Output,
+    starts: tuple[Underway, Start],
+    detections: Detections,
+    **given: Any,
 ) -> tuple[DqnState, Progress]:
-    mdp = held_out_mdp(config, inputs["fusion"], inputs["detections"], modality)
-    evaluation = comparison.evaluation(mdp, config)
-    learning = _environment(arena, config, modality, **inputs)
-    state, info = dqn.train_chunk(key, learning, config.dqn, state, starts, evaluation)
+    mdp = held_out_mdp(config, given["fusion"], detections, modality)
+    evaluate = comparison.evaluation(mdp, config, starts[1])
+    learning = _environment(config, modality, detections, **given)
+    state, info = dqn.train_chunk(key, learning, config.dqn, state, starts[0], evaluate)
     reward = jnp.where(info.episodes > 0, info.episode_return, jnp.nan)
     loss = jnp.where(info.is_finite, info.loss, jnp.nan)
     metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}

@@ -65,31 +65,28 @@ def held_out_mdp(
     return mdp_of_one(config, fusion, Bank(detections.held_out), modality, num_pois)
 
 
-def evaluation(mdp: Mdp, config: Config) -> Callable[[Key], dqn.Evaluate]:
-    """The mean total reward of a Q-network's policy, in one episode from each of random starts.
+def evaluation_starts(key: Key, mdp: Mdp, config: Config) -> Start:
+    """Random starts, `[evaluation.num_starts]`; all evaluations share them."""
+    reset = jax.vmap(lambda key: episodes.reset(key, mdp, make_bayes(config)))
+    return reset(jax.random.split(key, config.evaluation.num_starts))
 
-    The first key draws the starts; the second, in each call, the looks.
-    """
-    number = config.evaluation.num_starts
 
-    def prepare(key: Key) -> dqn.Evaluate:
-        reset = jax.vmap(lambda key: episodes.reset(key, mdp, make_bayes(config)))
-        starts = reset(jax.random.split(key, number))
+def evaluation(mdp: Mdp, config: Config, starts: Start) -> dqn.Evaluate:
+    """The mean total reward of a Q-network's policy, in one episode from each start."""
 
-        def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-            models = models_of(config, mdp.fusion, (), (q_network,) * len(config.modalities))
+    def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
+        models = models_of(config, mdp.fusion, (), (q_network,) * len(config.modalities))
 
-            def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
-                return policies.best(policies.latent(key, models, known)), memory
+        def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+            return policies.best(policies.latent(key, models, known)), memory
 
-            def episode(key: Key, start: Start) -> jax.Array:
-                return episodes.run_episode(key, mdp, models.bayes, act, start)[0]
+        def episode(key: Key, start: Start) -> jax.Array:
+            return episodes.run_episode(key, mdp, models.bayes, act, start)[0]
 
-            return jnp.mean(jax.vmap(episode)(jax.random.split(key, number), starts))
+        keys = jax.random.split(key, config.evaluation.num_starts)
+        return jnp.mean(jax.vmap(episode)(keys, starts))
 
-        return evaluate
-
-    return prepare
+    return evaluate
 
 
 def compare_policies(

@@ -14,7 +14,6 @@ from jaxsense.config import Config
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.models import Models, make_models
-from jaxsense.sim.world import make_world
 from jaxsense.training import agents, comparison, detections, jmvaes, measures, scans
 from jaxsense.training.stage import (
     Drive,
@@ -57,8 +56,8 @@ def train(drive: Drive, config: Config) -> None:
     perceive = _learn_from_scans if config.jmvae.learns_from == "scans" else _learn_from_detections
     learned = perceive(drive, config, surveys=surveyed, examples=examples)
     detectors, params, classes, detected, shown = learned
-    novelty = Stage("novelty", detections.learn_novelty)
-    drive(novelty, trained=detectors, scenes=scenes, **shown)
+    learn_novelty = Stage("novelty", detections.learn_novelty)
+    novelty = drive(learn_novelty, trained=detectors, scenes=scenes, **shown)
     known = {"detections": detected}
     drive(Stage("detector_metrics", measures.detector_metrics), **known)
 
@@ -74,8 +73,7 @@ def train(drive: Drive, config: Config) -> None:
     values = drive(solve, classes=classes, detections=detected)
     drive(Stage("beliefs", measures.beliefs), **known)
 
-    arena = make_world(config).arena
-    networks = agents.train(drive, config, arena, detectors=detectors, look_values=values, **known)
+    networks = agents.train(drive, config, detectors=detectors, novelty=novelty, **known)
     for m, name in enumerate(config.modalities):
         network = networks[agents.learner(config, name)]
         given = {"modality": jnp.int32(m), "q_network": network, "look_values": values, **known}

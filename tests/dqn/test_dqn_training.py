@@ -63,7 +63,8 @@ def states():
 def values(params):
     """`[4, 3]` values in the states above."""
     agent = learning_in(MDP, PROBE).agent
-    observed = jax.vmap(lambda b: agent.observe(b, alone(2, 0), jnp.ones((1, 2)), jnp.int32(0)))(states().belief)
+    team, times = alone(2, 0), jnp.ones((1, 2))
+    observed = jax.vmap(lambda b: agent.observe(b, team, times, jnp.int32(0)))(states().belief)
     return agent.values(params, observed.T).T
 
 
@@ -243,17 +244,17 @@ def length_of(key, params):
     return sum(jnp.sum(jnp.abs(x)) for x in jax.tree.leaves(params))
 
 
-@functools.partial(jax.jit, static_argnames="evaluation", compiler_options=FAST_TO_COMPILE)
-def train_from_epoch_5(config, evaluation):
+@functools.partial(jax.jit, static_argnames="evaluate", compiler_options=FAST_TO_COMPILE)
+def train_from_epoch_5(config, evaluate):
     prepared = training.starts(jax.random.key(2), LEARNING, config)
     state = training.init(jax.random.key(0), LEARNING, config, prepared)
     state = replace(state, epoch=jnp.int32(5))
-    return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluation)
+    return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluate)
 
 
 def trained_for(chunk, evaluate, **settings):
     """The state and the infos after one chunk of a small training, which begins at epoch 5."""
-    return train_from_epoch_5(replace(SMALL, epochs=chunk, **settings), lambda key: evaluate)
+    return train_from_epoch_5(replace(SMALL, epochs=chunk, **settings), evaluate)
 
 
 def test_the_policy_is_evaluated_after_every_tenth_epoch():

@@ -133,21 +133,6 @@ def test_nop_is_worth_nothing_and_one_network_serves_every_number_of_pois(number
     assert np.all(values[:-1] != 0)
 
 
-@pytest.mark.parametrize("number", [1, 2, 5])
-def test_each_poi_among_others_that_are_taken_to_be_different(number):
-    x, others = np.array(seen(number)), np.array(seen(number, seed=2))
-    others[-3:] = x[-3:]
-    if number == 5:
-        x[-3, 3] = others[-3, 3] = 0.0
-    among = jax.jit(lambda x, others: networks.apply(NETWORK, PARAMS, x.ravel(), others.ravel()))
-    found = among(x, others)
-    for poi in range(number):
-        changed = others.copy()
-        changed[:, poi] = x[:, poi]
-        np.testing.assert_allclose(found[poi], apply(changed)[poi], rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(among(x, x), apply(x), atol=1e-5)
-
-
 def test_a_batch_equals_single_ones():
     batch = jnp.stack([seen(3, seed) for seed in range(4)], axis=-1)
     batch = batch.at[-3, 1, 2].set(0.0)

@@ -41,7 +41,7 @@ def test_a_robot_looks_again_from_where_the_look_is_new(decides, models, arena_o
 
 
 def test_a_robot_leaves_a_poi_at_which_no_look_is_new(decides, models, arena_of):
-    values = with_values(models, [1.0, 0.0, 0.5, 0.0], [0.0] * 4)
+    values = with_values(models, [1.0, -0.1, 0.5, 0.0], [0.0] * 4)
     # No place is as far as 50 m from where the sensor has looked at PoI 0.
     far = Novelty(strength=jnp.full(2, 100.0), length=jnp.full(2, 15.0))
     values = replace(values, novelty=far)

@@ -57,26 +57,29 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     bank, held_out = (tuple(jnp.full((3, 4, 2), x) for _ in range(2)) for x in (0.5, 0.25))
     used = {}
 
-    def train_chunk(key, learning, config, state, starts, evaluation):
+    def train_chunk(key, learning, config, state, starts, evaluate):
         used["learning"], used["modality"] = learning.mdp.looks.features, learning.mdp.robots[0]
-        evaluation(key)(key, "network")
+        used["starts"] = starts
+        evaluate(key, "network")
         return state, SimpleNamespace(
             episodes=jnp.array([2, 0]), episode_return=jnp.array([1.5, 9.0]),
             is_finite=jnp.array([True, False]), loss=jnp.array([0.5, 0.25]),
             evaluation_return=jnp.array([jnp.nan, 3.0]), epsilon=jnp.ones(2),
         )  # fmt: skip
 
-    def evaluation(mdp, config):
+    def evaluation(mdp, config, starts):
         def evaluate(key, q_network):
             used["evaluation"], used["of"] = mdp.looks.features, (int(mdp.robots[0]), q_network)
+            used["evaluated"] = starts
 
-        return lambda key: evaluate
+        return evaluate
 
     monkeypatch.setattr(dqn, "train_chunk", train_chunk)
     monkeypatch.setattr(comparison, "evaluation", evaluation)
     stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
     found = {
-        "starts": None,
+        "starts": ("to learn from", "to evaluate"),
+        "novelty": models.novelty,
         "fusion": models.fusion,
         "detections": detections_of(bank, held_out, starts),
         **dict(zip(("detector_camera", "detector_lidar"), models.detectors, strict=True)),
@@ -86,6 +89,7 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
     number = int(name == "dqn_lidar")
     assert used["of"] == (number, "network")
     assert used["modality"] == number
+    assert (used["starts"], used["evaluated"]) == ("to learn from", "to evaluate")
     for each, expected in (("learning", bank), ("evaluation", held_out)):
         np.testing.assert_array_equal(used[each], expected)
     # No episode ended in the second epoch, and its loss is not finite.

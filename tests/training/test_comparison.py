@@ -64,8 +64,8 @@ def test_the_learned_return_is_the_mean_over_random_starts():
     @jax.jit
     def returned(bias):
         mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT), 0)
-        evaluate = comparison.evaluation(mdp, CONFIG)(jax.random.key(1))
-        return evaluate(KEY, with_bias(bias))
+        starts = comparison.evaluation_starts(jax.random.key(1), mdp, CONFIG)
+        return comparison.evaluation(mdp, CONFIG, starts)(KEY, with_bias(bias))
 
     assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0
     # Eight looks at PoI 0, of which all but the first are in vain, and that one in some starts: it
