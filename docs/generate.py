@@ -235,7 +235,7 @@ SETTINGS = """# Settings
 
 Each setting is an option of `python -m jaxsense.train`, with `-` in place of `_`:
 
-    python -m jaxsense.train --arena.num-pois 4 --mission.no-auctions
+    python -m jaxsense.train --arena.num-pois 4 --mdp.partly-seen-starts
 
 The name alone turns a setting on; `no-` before its last part turns it off. In Python, settings
 are frozen dataclasses: `dataclasses.replace(config, arena=dataclasses.replace(config.arena,

@@ -98,7 +98,7 @@ _NOISY = Config(
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
-    dqn=DqnConfig(hidden=(64, 64), epochs=1200),
+    dqn=DqnConfig(hidden=(64, 64), epochs=600),
     team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_looks=128),
     navigation=NavigationConfig(view_range=4.0),
@@ -127,6 +127,8 @@ _RAW = Config(
         steps=4000,
         batch=128,
     ),
+    dqn=DqnConfig(hidden=(64, 64), epochs=600),
+    team=TeamConfig(num_pois=(3, 8), sides=(3.0, 6.0)),
 )
 
 _TEAM = Config(
