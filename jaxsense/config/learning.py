@@ -214,7 +214,7 @@ class DqnConfig(Section, place="dqn"):
     observe: Literal["live", "bank"] = "bank"
     hidden: tuple[int, ...] = limited((32, 32), at_least=1, at_most=_MAX_UNITS, min_items=1)
     num_envs: int = limited(512, at_least=1)
-    epochs: int = limited(300, at_least=1)
+    epochs: int = limited(150, at_least=1)
     updates: int = limited(16, at_least=1)
     batch: int = limited(512, at_least=1)
     replay_capacity: int = limited(131072, at_least=1)
