@@ -184,7 +184,12 @@ CHANGES = [
     ({"evaluation.num_pois": (3,)}, "evaluation.num_pois = (3,): must be empty unless"),
     ({"team.num_pois": (4, 3)}, "team.num_pois = (4, 3): must be a minimum and a maximum, in this"),
     (
-        {"dqn.task": "team", "dqn.observe": "bank", "team.sides": (2.0, 3.0)},
+        {
+            "dqn.task": "team",
+            "dqn.observe": "bank",
+            "team.num_pois": (3, 8),
+            "team.sides": (2.0, 3.0),
+        },
         "team.sides = (2.0, 3.0): must be at least 2.33 m, so that 8 PoIs fit",
     ),
     ({"robots": ("camera", "sonar")}, "must each be one of modalities: camera, lidar"),

@@ -161,6 +161,7 @@ def test_an_episode_goes_on_until_nop_or_the_cut(monkeypatch):
         batch=4,
         replay_capacity=64,
         learning_rate=1e-9,
+        discount=0.5,
         epsilon_min=0.0,
     )
 

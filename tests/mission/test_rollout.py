@@ -18,7 +18,7 @@ from jaxsense.mission.state import ENDED, FAILED, Faults
 from jaxsense.sim import amiro
 
 NAIVE = 1
-STEPS, CHUNK = 240, 40
+STEPS, CHUNK = 280, 40
 NUM_POIS = CONFIG.arena.num_pois
 PERIOD = CONTROL_PERIOD
 FAULT_TIME = 4.0  # s

@@ -16,7 +16,7 @@ from jaxsense.training.detections import Detections
 CONFIG = Config(
     jmvae=JmvaeConfig(latent_size=3, hidden=(4,)),
     mdp=MdpConfig(min_increase=0.0, max_steps=8),
-    dqn=DqnConfig(hidden=(2,)),
+    dqn=DqnConfig(task="map", hidden=(2,)),
     evaluation=EvaluationConfig(num_starts=16, num_repeats=8),
 )
 KEY = jax.random.key(0)

@@ -46,13 +46,11 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
     def compared(models):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank), 0)
         return comparison.compare_policies(
-            KEY, models, mdp, config, {"mine": lambda *_: always.values(*[0] * 3)}
+            KEY, models, mdp, config, {"mine": lambda *_: always(*[0] * 3)}
         )
 
     monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
-    monkeypatch.setattr(
-        comparison, "reference", lambda *_: lambda known, classes: always.values(*[0] * 3)
-    )
+    monkeypatch.setattr(comparison, "reference", lambda *_: lambda known, classes: always(*[0] * 3))
     by_name = compared(models)
     found = np.array([by_name[name] for name in (*comparison.COMPARED, "mine")])
     assert found.shape == (6, 2, 12)  # with one of our own
