@@ -203,7 +203,7 @@ FUNCTIONS = [
         (lambda w, seed=seed: of_missions(w, seed=seed), f"seed = {seed}: must be a whole number")
         for seed in (-1, 2**32, True, 0.5)
     ),
-    (lambda w: start(w, policy=12), "policy = 12: must be a whole number from 0 to 11"),
+    (lambda w: start(w, policy=11), "policy = 11: must be a whole number from 0 to 10"),
     (lambda w: start(w, policy=-1), "policy = -1"),
     (lambda w: start(w, classes=BAD), "classes = 7"),
     (lambda w: start(w, faults=Faults(jnp.full(2, NAN), jnp.zeros(2))), "faults.stops_at = nan"),
