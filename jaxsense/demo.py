@@ -33,7 +33,7 @@ class Arguments(Checked):
     Attributes:
       preset: Preset with which the robots were trained: `default`, `noisy`, `many`, `raw` or
         `team`.
-      policy: Policy to compare with naive exploration: `latent` (the learned policy), `network`,
+      policy: Policy to compare with naive exploration: `latent` (the learned policy),
         `greedy`, `bayes`, `optimal`, `naive_2`, `naive_3`, `random`, `nearest`, `auction` or
         `rollout`.
       seed: Seed of the arena and of all noise, from 0 to 2^32 - 1. In the arenas of seeds 2 and 3,

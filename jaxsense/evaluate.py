@@ -51,7 +51,7 @@ class Arguments(Checked):
         newest one in `runs/`.
       episodes: Number of missions per policy.
       seed: Seed of the arenas and of all noise, from 0 to 2^32 - 1.
-      policy: What to play: `latent`, `network`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
+      policy: What to play: `latent`, `greedy`, `bayes`, `optimal`, `naive`, `naive_2`,
         `naive_3`, `random`, `nearest`, `auction` or `rollout`; `policies` for all of these;
         `ROBOT_alone`, `ROBOT_stops` or `ROBOT_blind`, such as `camera_alone`, for the latent policy
         in missions where that robot works alone, or stops or goes blind after 6 s; or `all` for
@@ -193,6 +193,9 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     """The run's settings with the arena and the team of these missions."""
     changed = {name: x for name, x in vars(arguments.arena).items() if x is not None}
     arena = dataclasses.replace(config.arena, **changed)
+    least, most = config.team.num_pois
+    if config.dqn.task == "team" and not least <= arena.num_pois <= most:
+        cli.warn(PROGRAM, f"{arena.num_pois} PoIs: the Q-network learned with {least} to {most}")
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):
         reason = f"must be {config.arena.num_pois}, as in training; only a run with "

@@ -126,7 +126,7 @@ def test_evaluations_by_others_stand_apart(copy, other):
     assert f"; {words}" in theirs
 
 
-def test_missions_elsewhere_have_the_settings_that_are_asked_for():
+def test_missions_elsewhere_have_the_settings_that_are_asked_for(capsys):
     config, anything = PRESETS["smoke"], lambda n: True
 
     def elsewhere(config, *arena, robots=None, plays=anything, **sizes):
@@ -155,6 +155,9 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for():
         evaluation=dataclasses.replace(team.evaluation, num_pois=(3, 8)),
     )
     assert elsewhere(partly, 30, 8.0).arena.num_pois == 30
+    assert "30 PoIs: the Q-network learned with 3 to 8" in capsys.readouterr().err
+    assert elsewhere(partly, 8, 8.0).arena.num_pois == 8
+    assert not capsys.readouterr().err
     with pytest.raises(ConfigError, match=r"arena\.num_pois = 4: must be 3, as in training"):
         elsewhere(config, 4, plays=lambda n: n == 3)
 

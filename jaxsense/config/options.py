@@ -158,7 +158,7 @@ class Option:
 
     @property
     def off(self) -> str:
-        """The option that sets False, such as `--mission.no-auctions`."""
+        """The option that sets False, such as `--mdp.no-partly-seen-starts`."""
         return re.sub(r"^(.*\.|--)", r"\1no-", self.name)
 
     @property

@@ -56,6 +56,10 @@ def start(key: Key, played: Environment, starts: PyTree) -> tuple[Float[Array, "
         return played.reset(key)
     row = jax.random.randint(key, (), 0, len(jax.tree.leaves(starts)[0]))
     state = jax.tree.map(lambda x: x[row], starts)
+    expected = jax.eval_shape(played.reset, key)[1]
+    shapes = [[x.shape for x in jax.tree.leaves(each)] for each in (state, expected)]
+    if shapes[0] != shapes[1]:
+        raise ValueError("starts are of another MDP: must be from prepared_starts of this one")
     return played.observe(state), state
 
 

@@ -39,7 +39,7 @@ def example():
 
 @pytest.fixture(scope="module")
 def team():
-    """Models of a team with tours, and their archive."""
+    """Models of a team, and their archive."""
     dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
     config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
     trained = untrained(config)
@@ -57,12 +57,13 @@ def test_a_team_may_have_any_number_of_points_and_robots(team, example):
         given |= {"looked_from": np.full_like(given["looked_from"], np.inf)}
         given |= {"works": np.ones(robots, bool), "target": np.full(robots, pois, np.int32)}
         found = programs["decide"](**given)
+        of_team = Team(**{key: jnp.asarray(given[key]) for key in Team.__dataclass_fields__})
         known = Known(
             belief=Belief(given["mean"], given["std"]),
             looks=jnp.zeros((pois, 2), jnp.int32),
             log_posterior=jnp.zeros((pois, 3)),
-            team=Team(**{key: jnp.asarray(given[key]) for key in Team.__dataclass_fields__}),
-            times=jnp.ones((robots, pois)),
+            team=of_team,
+            times=trained.agent.travel.times(of_team, jnp.zeros((robots, pois))),
             robot=given["robot"],
         )
         expected = policies.latent(None, trained, known)

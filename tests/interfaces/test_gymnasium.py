@@ -36,6 +36,12 @@ def make(starts):
     return functools.partial(MapVectorEnv, small.small_mdp().of(LIDAR), starts=starts)
 
 
+def test_starts_of_another_mdp_are_refused(starts):
+    other = jax.tree.map(lambda x: x[:, None], starts)
+    with pytest.raises(ValueError, match=r"^starts are of another MDP: must be from prepared"):
+        MapVectorEnv(small.small_mdp().of(LIDAR), num_envs=2, starts=other).reset(seed=0)
+
+
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_ends_are_followed_by_starts_as_in_gymnasiums_own(mode):
     theirs = SyncVectorEnv([lambda: ours.TaskEnv("map-v0")] * 3, autoreset_mode=mode)
