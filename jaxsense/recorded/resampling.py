@@ -63,14 +63,12 @@ def with_returns(ranges: np.ndarray) -> np.ndarray:
     return np.where(ranges == 0, np.float32(np.inf), ranges)
 
 
-def close_gaps(
-    angles: np.ndarray, ranges: np.ndarray, most: int = MAX_LOST, step: float | None = None
-) -> np.ndarray:
+def close_gaps(angles: np.ndarray, ranges: np.ndarray, step: float | None = None) -> np.ndarray:
     """Distances with gaps of lost beams filled by the nearest neighbour.
 
-    A gap is up to `most` beams in a row without a return, between two that have one. Gaps next to
-    something too near (minus infinity) or to directions that were not recorded stay. The last beam
-    of a full circle has the first as its neighbour.
+    A gap is up to `MAX_LOST` beams in a row without a return, between two that have one. Gaps next
+    to something too near (minus infinity) or to directions that were not recorded stay. The last
+    beam of a full circle has the first as its neighbour.
 
     Args:
       angles: `[A]` directions of the beams, in radians, in any order.
@@ -97,7 +95,7 @@ def close_gaps(
         return ranges
     behind = np.searchsorted(known, here)
     left, right = (known[np.clip(i, 0, len(known) - 1)] for i in (behind - 1, behind))
-    is_short = (left < here) & (here < right) & (right - left <= most + 1)
+    is_short = (left < here) & (here < right) & (right - left <= MAX_LOST + 1)
     is_short &= part[left] == part[right]
     has_both = np.isfinite(ranges[beams[left]]) & np.isfinite(ranges[beams[right]])
     nearest = np.where(here - left <= right - here, left, right)

@@ -121,14 +121,6 @@ def walls(*distances):
     return angles, np.repeat(distances, 20)[:, None] / np.cos(angles)[None]
 
 
-def compare_nothing():
-    """Looks of which no ray was recorded."""
-    nowhere, scans = np.zeros((1, 3)), {"lidar": np.full((1, 683), NAN, np.float32)}
-    return recorded.compare(
-        SMOKE, recorded.RecordedLooks(np.ones((1, 2)), {"lidar": nowhere}, scans)
-    )
-
-
 def start(w, **inputs):
     """A mission that begins with some inputs changed."""
     given = {"classes": w.classes, "policy": 0, "faults": no_faults(SMOKE), **inputs}
@@ -355,7 +347,6 @@ FUNCTIONS = [
     (lambda w: recorded.fit_noise(SMOKE.lidar, *walls(-1.0)), "ranges = -1.0"),
     (lambda w: recorded.fit_noise(SMOKE.lidar, *walls(1.2)), "20 pieces of walls"),
     (lambda w: recorded.fit_noise(SMOKE.lidar, *walls(1.2, 2.2)), "scans show no edges"),
-    (lambda w: compare_nothing(), "lidar_scans: no window around a PoI was rec"),
     (lambda w: registry.agents("map"), "name = 'map': must be one of map-v0"),
     (lambda w: jaxsense.make("map-v0", "sonar"), "agent = 'sonar': must be one of camera, lidar"),
     (lambda w: jaxsense.score(jaxsense.make("map-v0"), nop, agent="lidar"), "agent = 'lidar'"),

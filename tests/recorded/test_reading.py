@@ -104,11 +104,11 @@ def test_a_distance_of_0_is_no_return(write):
         ),
         (
             {"lidar_angles": HALF_CIRCLE[:60], "lidar_scans": EMPTY[:, :60]},
-            "85 rays of lidar were recorded: must be at least 128, as wide as the window",
+            "85 neighbouring rays of lidar were recorded: must be at least 128, the window",
         ),
         (
             {"lidar_angles": HALF_CIRCLE[::5], "lidar_scans": EMPTY[:, :73]},
-            "step between the rays of lidar = 2.50 degrees: must be at most 1.06 degrees",
+            "2 neighbouring rays of lidar .* from rays at most 1.06 degrees apart",
         ),
     ],
 )

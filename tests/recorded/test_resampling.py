@@ -77,10 +77,10 @@ def test_pixels_are_interpolated_for_each_channel():
 @pytest.mark.parametrize(
     ("angles", "reason"),
     [
-        (degrees(-40, 0, 40), r"step between the rays of lidar = 40.00 degrees: must be at most"),
-        (degrees(0), r"step between the rays of lidar = inf degrees"),
-        (degrees(0, 5, 10), r"2 rays of lidar were recorded: must be at least 3, as wide as the"),
-        (degrees(*range(150, 211, 10)), "0 rays of lidar were recorded: must"),
+        (degrees(-40, 0, 40), "1 neighbouring rays .* at least 3, .* at most 30.00 degrees apart"),
+        (degrees(0), "1 neighbouring rays"),
+        (degrees(0, 5, 10), "2 neighbouring rays of lidar were recorded: must be at least 3, the"),
+        (degrees(*range(150, 211, 10)), "0 neighbouring rays of lidar were recorded: must"),
     ],
 )
 def test_scans_that_do_not_suffice_are_refused_with_what_would_fit(angles, reason):
@@ -162,7 +162,6 @@ def test_short_gaps_between_beams_are_closed():
         assert np.isfinite(found).all() == is_closed
         assert found.dtype == np.float32
     np.testing.assert_array_equal(found, np.float32(scan))
-    np.testing.assert_array_equal(close_gaps([1.0, inf, inf, 4.0], 1)[1:3], inf)
 
 
 @pytest.mark.parametrize(
@@ -174,9 +173,9 @@ def test_gaps_between_no_directions_are_refused(angles, ranges, told):
         resampling.close_gaps(np.float64(angles), np.float64(ranges))
 
 
-def close_gaps(ranges, *most):
+def close_gaps(ranges):
     """Closes gaps between beams of ten degrees."""
-    return resampling.close_gaps(np.radians(10.0 * np.arange(len(ranges))), ranges, *most)
+    return resampling.close_gaps(np.radians(10.0 * np.arange(len(ranges))), ranges)
 
 
 @pytest.mark.parametrize(("first", "turn"), [(0, 1), (-180, 1), (10, 1), (0, -1), (180, -1)])
