@@ -46,8 +46,7 @@ class Models:
       novelty: how much of a look is new evidence.
       look_values: for each modality, the values of looks by dynamic programming.
       agent: how the Q-networks are used.
-      q_networks: for each modality, parameters of the Q-network; once trained, the same for all in
-        a team.
+      q_networks: for each modality, parameters of the Q-network; of a team, one for all.
     """
 
     detectors: tuple[Detector, ...]
@@ -270,7 +269,7 @@ def init(key: Key, config: Config) -> Models:
     """Untrained models, to try functions before training."""
     detector_key, jmvae_key, dqn_key, filter_key = jax.random.split(key, 4)
     model, agent = make_jmvae(config), make_agent(config)
-    dqn_keys = jax.random.split(dqn_key, len(config.modalities))
+    dqn_keys = jax.random.split(dqn_key, len(config.modalities) if agent.travel is None else 1)
     shape = len(config.arena.classes), model.latent_size
     classes = Belief(jnp.zeros(shape), jnp.ones(shape))
     made, keys = sensors.make(config), jax.random.split(detector_key, len(config.modalities))

@@ -41,7 +41,7 @@ class Trained(Protocol):
 
     @property
     def q_networks(self) -> tuple[Params, ...]:
-        """Parameters for each modality."""
+        """Parameters for each modality, or of one for all."""
         ...
 
 
@@ -94,8 +94,10 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
         nearest = jax.tree.map(lambda x: jnp.asarray(x)[jnp.argmin(apart, axis=-1)], classes)
         there = team.present[:, None]
         belief = jax.tree.map(lambda own, x: jnp.where(there, own, x), belief, nearest)
-    own = jax.tree.map(lambda *x: jnp.stack(x)[known.modality], *models.q_networks)
-    return agent.values(own, agent.observe(belief, team, known.times, known.robot))
+    observed = agent.observe(belief, team, known.times, known.robot)
+    # Picked parameters would be one network for each row of a batch.
+    values = [agent.values(params, observed) for params in models.q_networks]
+    return values[0] if len(values) == 1 else jnp.stack(values)[known.modality]
 
 
 def _by_exact_bayes(read: Callable[..., jax.Array]) -> Gains:

@@ -21,7 +21,7 @@ from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.programs import Programs
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
-from jaxsense.training.agents import learner
+from jaxsense.training.agents import learner, learners
 from jaxsense.training.comparison import permutations
 from jaxsense.training.measures import reliability
 from jaxsense.training.stage import Output, Progress, Stage
@@ -110,7 +110,7 @@ def learn(
             network.removeprefix("dqn_"): {
                 name: curves[network][name] for name in ("reward", "evaluation")
             }
-            for network in (learner(config, n) for n in config.modalities)
+            for network in learners(config)
         },
         results={
             "detectors": make.plain(outputs["detector_metrics"]),

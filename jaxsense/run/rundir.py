@@ -27,7 +27,7 @@ from jaxsense.summary.compare import UNKNOWN
 from jaxsense.summary.read import ORIGINS, read_origins
 from jaxsense.tasks.registry import PREFIX, load_pretrained
 from jaxsense.training import stages
-from jaxsense.training.agents import learner
+from jaxsense.training.agents import learners
 
 _METRICS = "metrics.jsonl"
 _MOST_METRICS = 2**28  # bytes
@@ -293,14 +293,14 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
 def _named(models: Models, config: Config) -> dict[str, PyTree]:
     """The parts of the models, by the names of their stages and checkpoints."""
     detectors = zip(config.modalities, models.detectors, strict=True)
-    q_networks = zip(config.modalities, models.q_networks, strict=True)
+    q_networks = zip(learners(config), models.q_networks, strict=True)
     return {
         **{f"detector_{name}": detector for name, detector in detectors},
         "best_jmvae": models.jmvae,
         "novelty": models.novelty,
         "fusion": models.fusion,
         "look_values": models.look_values,
-        **{learner(config, name): q_network for name, q_network in q_networks},
+        **dict(q_networks),
     }
 
 
@@ -330,7 +330,7 @@ def rewards(
             return None
 
     curves: dict[str, dict[str, np.ndarray]] = {}
-    for network in dict.fromkeys(learner(config, name) for name in config.modalities):
+    for network in learners(config):
         of_runs = [each for run in runs if (each := found(network, run))]
         curves[network.removeprefix("dqn_")] = {
             name: np.array([each[name] for each in of_runs]).reshape(-1, epochs)

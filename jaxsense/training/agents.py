@@ -89,20 +89,19 @@ def train(
     given = {"fusion": fusion, "detectors": detectors, "novelty": novelty}
     starts = drive(Stage("starts", _starts), detections=detections, **given)
     networks: dict[str, Output] = {}
-    for m, name in enumerate(config.modalities):
-        # A team's one network is evaluated with the first sensor.
-        if (network := learner(config, name)) not in networks:
-            stage = Stage(
-                network,
-                _begin,
-                _advance,
-                _params,
-                steps=config.dqn.epochs,
-                chunks=config.dqn.epochs // config.dqn.chunk,
-                shares="dqn",
-            )
-            of_sensor = {"modality": jnp.int32(m), "starts": starts, "detections": detections}
-            networks[network] = drive(stage, **of_sensor, **given)
+    # A team's one network is evaluated with the first sensor.
+    for m, network in enumerate(learners(config)):
+        stage = Stage(
+            network,
+            _begin,
+            _advance,
+            _params,
+            steps=config.dqn.epochs,
+            chunks=config.dqn.epochs // config.dqn.chunk,
+            shares="dqn",
+        )
+        of_sensor = {"modality": jnp.int32(m), "starts": starts, "detections": detections}
+        networks[network] = drive(stage, **of_sensor, **given)
     return networks
 
 
@@ -180,6 +179,11 @@ def _params(config: Config, state: DqnState, **_: Output) -> Params:
 def learner(config: Config, modality: str) -> str:
     """Name of the stage that trains the Q-network of a modality's robots."""
     return "dqn_team" if config.dqn.task == "team" else f"dqn_{modality}"
+
+
+def learners(config: Config) -> tuple[str, ...]:
+    """Names of all stages that train Q-networks, in the order of `Models.q_networks`."""
+    return tuple(dict.fromkeys(learner(config, modality) for modality in config.modalities))
 
 
 def _surveyed_starts(key: Key, learning: Environment, starts: Starts, number: int) -> Underway:

@@ -75,7 +75,7 @@ def evaluation(mdp: Mdp, config: Config, starts: Start) -> dqn.Evaluate:
     """The mean total reward of a Q-network's policy, in one episode from each start."""
 
     def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-        models = models_of(config, mdp.fusion, (), (q_network,) * len(config.modalities))
+        models = models_of(config, mdp.fusion, (), (q_network,))
 
         def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
             return policies.best(policies.latent(key, models, known)), memory
@@ -100,7 +100,7 @@ def compare_policies(
 
     Args:
       key: random key.
-      models: whose `q_networks` are all of the robot's modality.
+      models: whose only Q-network is that of the robot's modality.
       mdp: from `held_out_mdp`.
       config: all settings.
       own: custom policies by name.
@@ -216,8 +216,7 @@ def play_policies(
     num_pois: int | None = None,
 ) -> Rewards:
     """Runs `compare_policies` for one modality; with as many PoIs as in the arena by default."""
-    q_networks = (q_network,) * len(config.modalities)
-    models = models_of(config, fusion, look_values, q_networks)
+    models = models_of(config, fusion, look_values, (q_network,))
     mdp = held_out_mdp(config, fusion, detections, modality, num_pois)
     return compare_policies(key, models, mdp, config)
 

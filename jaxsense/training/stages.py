@@ -166,7 +166,7 @@ def models(outputs: Mapping[str, Output], config: Config) -> Models:
         fusion=outputs["fusion"],
         novelty=outputs["novelty"],
         look_values=outputs["look_values"],
-        q_networks=tuple(outputs[agents.learner(config, name)] for name in config.modalities),
+        q_networks=tuple(outputs[name] for name in agents.learners(config)),
     )
 
 
