@@ -17,16 +17,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
 
-from jaxsense.config import Shape
 from jaxsense.config.scene import POI_HEIGHT, TIMESTEP, ArenaConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.sim import amiro
 
-WALL_HEIGHT = 0.3  # m
-WALL_THICKNESS = 0.05  # m
 _STORE = -2.0  # m, height of hidden shapes, below the floor
-_WALL_COLOUR = (0.6, 0.6, 0.6)
 
 
 @pytree
@@ -76,7 +72,7 @@ class Arena:
     @functools.cached_property
     def poi_of_geom(self) -> Int[np.ndarray, "G"]:
         """Index of the PoI that each geom belongs to, or -1."""
-        body = self.mj_model.geom_bodyid - 1  # in the order of `_mjcf`: world, PoIs, robots
+        body = self.mj_model.geom_bodyid - 1  # in the order of the MJCF: world, PoIs, robots
         return np.where(body < self.mj_model.nmocap, body // len(self.config.shapes), -1)
 
     @functools.cached_property
@@ -104,78 +100,27 @@ def build(
       contacts: whether robots collide with PoIs, with each other and with the walls.
       obstacles: whether there are PoIs and walls.
     """
-    mjcf = _mjcf(config, lidar_robots, contacts, obstacles)
-    mj_model = mujoco.MjModel.from_xml_string(mjcf)  # pyright: ignore[reportAttributeAccessIssue]
+    import jinja2  # noqa: PLC0415  (whoever builds no arena need not wait for it)
+
+    loader, undefined = jinja2.PackageLoader("jaxsense.sim", "."), jinja2.StrictUndefined
+    mjcf = jinja2.Environment(loader=loader, undefined=undefined).get_template("arena.xml.jinja")
+    mj_model = mujoco.MjModel.from_xml_string(  # pyright: ignore[reportAttributeAccessIssue]
+        mjcf.render(
+            amiro=amiro,
+            config=config,
+            lidar_robots=lidar_robots,
+            contacts=contacts,
+            obstacles=obstacles,
+            timestep=TIMESTEP,
+            poi_height=POI_HEIGHT,
+        )
+    )
     # By default MJX takes the first device of all processes.
     device = jax.local_devices()[0]
     with jax.ensure_compile_time_eval():  # it outlives a program that is being traced
         model = mjx.put_model(mj_model, device=device, impl="jax")
         data = mjx.make_data(model, device=device)
     return Arena(config, mj_model, model, data, len(lidar_robots))
-
-
-def _mjcf(
-    config: ArenaConfig, lidar_robots: tuple[bool, ...], contacts: bool, obstacles: bool
-) -> str:
-    """Writes the MJCF of the whole arena."""
-    reach = config.side / 2 - amiro.BODY_RADIUS
-    robots = [f"robot{r}" for r in range(len(lidar_robots))]
-    pois = "".join(
-        _poi(f"poi{n}_{name}", shape, config, contacts)
-        for n in range(config.num_pois)
-        for name, shape in config.shapes.items()
-    )
-    bits = (1, 2) if contacts else (0, 0)
-    # MJX's implicitfast ignores the force limit of a servo and accelerates a third less than
-    # C MuJoCo. Euler is stable because the servos' time constant is two steps.
-    return f"""
-    <mujoco model="jaxsense">
-      <compiler angle="degree" autolimits="true"/>
-      <option timestep="{TIMESTEP}" integrator="Euler" iterations="1" ls_iterations="4">
-        <flag eulerdamp="disable" {"" if contacts else 'contact="disable" limit="disable"'}/>
-      </option>
-      <default>
-        <geom contype="0" conaffinity="0"/>
-        <default class="collider">
-          <geom contype="{bits[0]}" conaffinity="{bits[0] | bits[1]}" condim="1" group="3"/>
-        </default>
-        <default class="obstacle">
-          <geom contype="{bits[1]}" conaffinity="0" condim="1"/>
-        </default>
-      </default>
-      <worldbody>
-        {_walls(config) + pois if obstacles else ""}
-        {"".join(amiro.body(n, h, reach) for n, h in zip(robots, lidar_robots, strict=True))}
-      </worldbody>
-      <actuator>{"".join(map(amiro.actuators, robots))}</actuator>
-    </mujoco>"""
-
-
-def _walls(config: ArenaConfig) -> str:
-    """Writes the MJCF of the four walls."""
-    offset = (config.side + WALL_THICKNESS) / 2
-    half = (WALL_THICKNESS / 2, config.side / 2 + WALL_THICKNESS)
-    return "".join(
-        f'<geom name="wall{w}" type="box" pos="{x} {y} {WALL_HEIGHT / 2}" '
-        f'size="{half[abs(y) > 0]} {half[abs(x) > 0]} {WALL_HEIGHT / 2}" '
-        f'rgba="{" ".join(map(str, _WALL_COLOUR))} 1"/>'
-        for w, (x, y) in enumerate(((offset, 0), (0, offset), (-offset, 0), (0, -offset)))
-    )
-
-
-def _poi(name: str, shape: Shape, config: ArenaConfig, contacts: bool) -> str:
-    """Writes the MJCF of one solid of one PoI."""
-    u, v = (share * config.poi_radius for share in shape.half_sides)
-    half_height = POI_HEIGHT / 2
-    size = f"{u} {half_height}" if shape.is_round else f"{u} {v} {half_height}"
-    solid = f'<geom name="{name}" type="{shape.primitive}" size="{size}"'
-    collides = 'class="obstacle"/>'
-    if not (shape.is_round and contacts):
-        return f'<body name="{name}" mocap="true">{solid} {collides}</body>'
-    # MJX finds contacts with cylinders iteratively, with capsules in closed form. At the height of
-    # a robot's collider, both have the same cross-section.
-    capsule = f'<geom name="{name}_collider" type="capsule" size="{size}" group="3" {collides}'
-    return f'<body name="{name}" mocap="true">{solid}/>{capsule}</body>'
 
 
 @checks.typed
