@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import hashlib
 from collections import ChainMap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -15,8 +15,6 @@ from jax.extend import core
 from onnx import helper
 
 Struct = jax.ShapeDtypeStruct
-Equation = Any
-"""Of a function that JAX has traced."""
 Size = Any
 """The size of an axis: a number, or an expression of JAX such as `pois + 1`."""
 
@@ -148,32 +146,6 @@ class Graph:
             outputs = [found] if isinstance(found, str) else found
             names |= dict(zip(equation.outvars, outputs, strict=True))
         return [read(variable) for variable in jaxpr.outvars]
-
-    def within(
-        self, inputs: Mapping[str, Any], body: Callable[["Graph"], Sequence[str]]
-    ) -> onnx.GraphProto:
-        """A graph within this one, of which each output has a name of its own."""
-        inner = dataclasses.replace(self, known=self.known.new_child(), nodes=[])
-        outputs = [inner.ops("Identity", 1, x)[0] for x in body(inner)]
-        untyped = [helper.make_empty_tensor_value_info(x) for x in outputs]
-        given = [info(*each) for each in inputs.items()]
-        return helper.make_graph(inner.nodes, "body", given, untyped)
-
-    def loop(
-        self,
-        most: Any,
-        goes_on: Any,
-        carry: Sequence[str],
-        equation: Equation,
-        body: Callable[["Graph", str, list[str]], Sequence[str]],
-    ) -> list[str]:
-        """ONNX's loop: `body(inner, step, carry)` gives whether it continues, carry and rows."""
-        of_carry = [v.aval for v in equation.outvars[: len(carry)]]
-        kinds = [Struct((), np.int64), Struct((), bool), *of_carry]
-        inputs = {next(self.names): kind for kind in kinds}
-        step, _, *within = inputs
-        graph = self.within(inputs, lambda inner: body(inner, step, within))
-        return self.ops("Loop", len(equation.outvars), most, goes_on, *carry, body=graph)
 
 
 def info(name: str, array: Any) -> onnx.ValueInfoProto:

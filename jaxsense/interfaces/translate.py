@@ -4,6 +4,7 @@ The graph of a function follows from the function itself, so that a new fusion, 
 needs no line here, unless it uses a primitive that `_OPERATORS` lacks.
 """
 
+import dataclasses
 import itertools
 from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
@@ -19,10 +20,13 @@ from jaxtyping import PyTree
 from onnx import checker, helper, numpy_helper
 
 from jaxsense.core.types import by_place
-from jaxsense.interfaces.graph import Equation, Graph, Struct, info, require
+from jaxsense.interfaces.graph import Graph, Struct, info, require
 
 OPSET, IR_VERSION = 18, 9
 """The version of the operators, and of the file: of December 2022, so that old runtimes read it."""
+
+Equation = Any
+"""Of a function that JAX has traced."""
 
 
 # Each of these builds the operators of an equation of JAX, from the names of its inputs.
@@ -141,38 +145,17 @@ def _gather(graph: Graph, e: Equation, x: str, indices: str) -> str:
     return graph.taken(x, found, terms)
 
 
-def _scatter(adds: bool) -> Callable[..., str]:
+def _scatter(graph: Graph, e: Equation, x: str, indices: str, updates: str) -> str:
     """Changes one row, along one axis, unless the row does not exist."""
-
-    def scatter(graph: Graph, e: Equation, x: str, indices: str, updates: str) -> str:
-        numbers, shape = e.params["dimension_numbers"], e.invars[0].aval.shape
-        mapped = [*numbers.scatter_dims_to_operand_dims]
-        is_row = len(mapped) == 1 and [*numbers.inserted_window_dims] == mapped
-        is_one = e.invars[1].aval.ndim == 1 and not numbers.operand_batching_dims
-        require(is_row and is_one, "scatter of several rows")
-        (axis,) = mapped
-        row = graph.cast(indices, np.int64)
-        is_row = graph.op("Equal", graph.range(shape[axis]), row)
-        is_row = graph.op("Unsqueeze", is_row, [n for n in range(1, len(shape) - axis)])
-        new = graph.op("Unsqueeze", updates, [axis])
-        new = graph.op("Add", x, new) if adds else new
-        return graph.where(is_row, new, x, e.invars[0].aval.dtype)
-
-    return scatter
-
-
-def _platform_index(graph: Graph, e: Equation) -> str:
-    return graph.constant(np.int32(e.params["platforms"].index(None)))
-
-
-def _cond(graph: Graph, e: Equation, index: str, *given: str) -> list[str]:
-    branches = e.params["branches"]
-    if index in graph.constants:
-        return graph.run(branches[int(graph.constants[index])], given)
-    require(len(branches) == 2, "a choice among more than two")
-    no, yes = (graph.within({}, lambda inner, b=b: inner.run(b, given)) for b in branches)
-    is_second = graph.cast(index, bool)
-    return graph.ops("If", len(e.outvars), is_second, then_branch=yes, else_branch=no)
+    numbers, shape = e.params["dimension_numbers"], e.invars[0].aval.shape
+    mapped = [*numbers.scatter_dims_to_operand_dims]
+    is_row = len(mapped) == 1 and [*numbers.inserted_window_dims] == mapped
+    is_one = e.invars[1].aval.ndim == 1 and not numbers.operand_batching_dims
+    require(is_row and is_one, "scatter of several rows")
+    (axis,) = mapped
+    is_row = graph.op("Equal", graph.range(shape[axis]), graph.cast(indices, np.int64))
+    is_row = graph.op("Unsqueeze", is_row, [n for n in range(1, len(shape) - axis)])
+    return graph.where(is_row, graph.op("Unsqueeze", updates, [axis]), x, e.invars[0].aval.dtype)
 
 
 def _scan(graph: Graph, e: Equation, *given: str) -> list[str]:
@@ -183,35 +166,29 @@ def _scan(graph: Graph, e: Equation, *given: str) -> list[str]:
     number = sum(v.aval.ndim == x.ndim for v, x in zip(after, inner.out_avals, strict=True))
     last = len(before) - rows
     consts, carry, moving = given[: last - number], given[last - number : last], given[last:]
-
-    def body(within: Graph, step: str, carry: list[str]) -> list[Any]:
-        of_step = [within.op("Gather", row, step, axis=0) for row in moving]
-        return [within.constant(np.bool_(True)), *within.run(inner, [*consts, *carry, *of_step])]
-
-    return graph.loop(graph.size(e.params["length"]), np.bool_(True), carry, e, body)
-
-
-def _while(graph: Graph, e: Equation, *given: str) -> list[str]:
-    condition, change = e.params["cond_jaxpr"], e.params["body_jaxpr"]
-    first = e.params["cond_nconsts"]
-    last = first + e.params["body_nconsts"]
-
-    def body(within: Graph, step: str, carry: list[str]) -> list[str]:
-        after = within.run(change, [*given[first:last], *carry])
-        return [*within.run(condition, [*given[:first], *after]), *after]
-
-    (goes_on,) = graph.run(condition, [*given[:first], *given[last:]])
-    return graph.loop("", goes_on, given[last:], e, body)
+    # The graph of one step, of which each output has a name of its own.
+    kinds = [Struct((), np.int64), Struct((), bool), *(v.aval for v in after[:number])]
+    inputs = {next(graph.names): kind for kind in kinds}
+    step, goes_on, *within = inputs
+    body = dataclasses.replace(graph, known=graph.known.new_child(), nodes=[])
+    of_step = [body.op("Gather", row, step, axis=0) for row in moving]
+    found = [goes_on, *body.run(inner, [*consts, *within, *of_step])]
+    outputs = [body.ops("Identity", 1, x)[0] for x in found]
+    untyped = [helper.make_empty_tensor_value_info(x) for x in outputs]
+    given_info = [info(*each) for each in inputs.items()]
+    whole = helper.make_graph(body.nodes, "body", given_info, untyped)
+    length = graph.size(e.params["length"])
+    return graph.ops("Loop", len(after), length, np.bool_(True), *carry, body=whole)
 
 
-_CALLS = "jit", "custom_jvp_call", "custom_vjp_call"
 # Runtimes take `and`, `or` and `not` of bools alone.
 _SAME = (
     "add", "sub", "mul", "div", "max", "min", "pow", "exp", "log", "tanh", "tan", "sqrt", "abs",
     "neg", "sign", "floor", "ceil", "and", "or", "not",
 )  # fmt: skip
 _OPERATORS: dict[str, str | Callable[..., str | list[str]]] = {
-    **dict.fromkeys(_CALLS, _inlined),
+    "jit": _inlined,
+    "custom_jvp_call": _inlined,
     **{name: name.capitalize() for name in _SAME},
     "logistic": "Sigmoid",
     "lt": "Less",
@@ -255,12 +232,8 @@ _OPERATORS: dict[str, str | Callable[..., str | list[str]]] = {
     "argmin": _best("ArgMin"),
     "dot_general": _product,
     "gather": _gather,
-    "scatter": _scatter(adds=False),
-    "scatter-add": _scatter(adds=True),
-    "platform_index": _platform_index,
-    "cond": _cond,
+    "scatter": _scatter,
     "scan": _scan,
-    "while": _while,
 }
 """Primitives of JAX: the operator that each is, or what builds its operators."""
 
