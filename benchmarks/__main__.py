@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import json
 from pathlib import Path
-from typing import Annotated
 
 import jax
 import rich.console
@@ -12,7 +11,7 @@ import rich.table
 
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row, reserve
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli, devices, output
 
@@ -25,20 +24,20 @@ class Arguments:
     """Measures each stage, and with --peers those who do the same, and prints one table.
 
     Attributes:
-      names: Rows to measure; all by default. A wrong one lists them.
+      rows: Rows to measure; all by default. A wrong one lists them.
       peers: Also measure other libraries on the same work, in turn.
       json: File to write; must be new.
       quick: Use tiny sizes, to check that everything runs.
     """
 
-    names: Annotated[tuple[str, ...], Name("ROWS")] = ()
+    rows: Positional[tuple[str, ...]] = ()
     peers: bool = False
     json: Path | None = None
     quick: bool = False
 
     def __post_init__(self):
         check_fields(self)
-        require(set(self.names) <= set(ROWS), self, "names", f"must be some of {', '.join(ROWS)}")
+        require(set(self.rows) <= set(ROWS), self, "rows", f"must be some of {', '.join(ROWS)}")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -54,7 +53,7 @@ def main(argv: list[str] | None = None) -> None:
     if not console.is_terminal:
         console.width = _WIDTH_OF_FILES
     rows: list[Row] = []
-    for name in dict.fromkeys(arguments.names or ROWS):
+    for name in dict.fromkeys(arguments.rows or ROWS):
         with console.status(name):
             rows.append(ROWS[name](Options(arguments.peers, arguments.quick)))
         if arguments.json is not None:

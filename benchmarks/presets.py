@@ -6,10 +6,9 @@ Cells are ranges over the seeds of a preset.
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
 
 from jaxsense.config import ConfigError
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.config.section import check_fields, require
 from jaxsense.run import cli
 from jaxsense.summary.blocks import Results, Summary
@@ -135,7 +134,7 @@ class Arguments:
       runs: Their directories, at least one.
     """
 
-    runs: Annotated[tuple[Path, ...], Name("RUNS")] = ()
+    runs: Positional[tuple[Path, ...]] = ()
 
     def __post_init__(self):
         check_fields(self)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ import numpy as np
 import jaxsense
 from benchmarks import measure, peers
 from benchmarks.dqn import Dqn
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.config.section import check_fields, limited, require
 from jaxsense.run import cli
 from jaxsense.tasks import Recurrent, Task
@@ -76,7 +76,7 @@ class Arguments:
       quick: Take as few steps as possible, to check that everything runs.
     """
 
-    learners: Annotated[tuple[str, ...], Name("LEARNERS")] = ()
+    learners: Positional[tuple[str, ...]] = ()
     only: tuple[str, ...] = ()
     seeds: int = limited(10, at_least=1, at_most=10)
     jobs: int = limited(2, at_least=1, at_most=1024)

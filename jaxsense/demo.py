@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> None:
                 player = missions.Player(scenario, compiler, len(played))
                 found = player.play(jax.random.key(arguments.seed), models, played, episodes=1)
             recordings = {f"{name} policy": each for name, each in found.recordings.items()}
-            films = film.draw(config, recordings, models.fusion, scenario.fields_of_view)
+            films = film.draw(config, recordings, models.fusion)
             block = make.missions(config, found.metrics)
             table = tables.missions(block, "One mission of each policy, in the same arena")
             path = place / "demo.html"

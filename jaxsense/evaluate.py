@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
 
 import jax
 import rich.console
@@ -12,7 +11,7 @@ import rich.table
 from jaxsense import mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD, MAX_EPISODES
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.config.scene import TIMESTEP
 from jaxsense.config.section import Checked, limited
 from jaxsense.run import cli, devices, files, missions, output, rundir
@@ -65,7 +64,7 @@ class Arguments(Checked):
       trust: Trust the run's `config.json`: run the code of custom sensors that it names.
     """
 
-    run: Annotated[Path, Name("RUN")]
+    run: Positional[Path]
     episodes: int = limited(256, at_least=1, at_most=MAX_EPISODES)
     seed: int = limited(0, at_least=0, at_most=MAX_SEED)
     policy: str = "all"
@@ -109,7 +108,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         if arguments.animate:
             (name, recording), *_ = found.recordings.items()
             title, stem = _film(arguments, trained, config, name)
-            (text,) = film.draw(config, {title: recording}, models.fusion, scenario.fields_of_view)
+            (text,) = film.draw(config, {title: recording}, models.fusion)
             path = arguments.run / f"{stem}.svg"
             files.write(path, text)
             written.append(f"The first mission of {name} is in {path}.")

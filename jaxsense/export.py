@@ -13,7 +13,7 @@ import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jax import export
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import Search
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.config.scene import MAX_BEARING
 from jaxsense.config.section import Checked
 from jaxsense.core.types import Belief
@@ -310,7 +310,7 @@ class Arguments(Checked):
       trust: Trust the run's `config.json`: run the code of custom sensors that it names.
     """
 
-    run: Annotated[Path, Name("RUN")]
+    run: Positional[Path]
     out: Path | None = None
     trust: bool = False
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, NoReturn
+from typing import NoReturn
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ import rich.console
 import rich.table
 
 from jaxsense.config import PRESETS, Config, ConfigError
-from jaxsense.config.options import Name, command, given
+from jaxsense.config.options import command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, files, output, pipeline, rundir
@@ -70,7 +70,7 @@ class Arguments(Checked):
       cache: Directory in which to cache compiled programs; `none` for no cache.
     """
 
-    settings: Annotated[Settings, Name("--")] = Settings()
+    settings: Settings = Settings()
     out: Path | None = None
     config: Path | None = None
     resume: Path | None = None
@@ -274,9 +274,9 @@ def _results(
     key, config = jax.random.key(run.settings.seed), run.settings.config
     # In one thread of its own, because matplotlib does not work in several at once.
     with ThreadPoolExecutor(1, "draw") as artist:
-        learned = pipeline.learn(key, config, programs, monitor, run.checkpoints)
+        learned = pipeline.learn(key, programs, run.checkpoints)
         of_training = artist.submit(lambda: _drawing().of_training(config, learned))
-        played, block = pipeline.play(key, config, programs, learned, run.checkpoints)
+        played, block = pipeline.play(key, programs, learned, run.checkpoints)
         of_missions = artist.submit(lambda: _drawing().of_missions(config, learned, played, block))
         pictures = of_training.result() | of_missions.result()
     return {**learned.results, "mission": block}, pictures

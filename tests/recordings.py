@@ -32,7 +32,6 @@ class StubFusion:
 FUSION = StubFusion(
     CLASS_BELIEFS, Belief(np.zeros(2, np.float32), np.full(2, np.sqrt(20.0), np.float32))
 )
-FIELDS_OF_VIEW = {"camera": 60.0, "lidar": 240.0}
 
 
 def recording(steps: int = 60) -> Recording:

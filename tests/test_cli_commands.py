@@ -16,7 +16,7 @@ from untrained import blank
 
 import jaxsense
 from jaxsense import __main__ as commands
-from jaxsense import demo, export, mission, task_list, tasks
+from jaxsense import demo, export, task_list, tasks
 from jaxsense.run import output
 from jaxsense.run.missions import Played
 from jaxsense.tasks.registry import TASKS, agents
@@ -171,11 +171,6 @@ def test_the_demo_refuses_what_it_cannot_do_and_changes_nothing(played, capsys, 
     (played / "full" / "file").write_text("precious")
     assert f"jaxsense.demo: {error}" in error_line([*NO_CACHE, *argv], capsys, demo)
     assert sorted(path.name for path in played.rglob("*")) == ["file", "full"]
-
-
-def test_a_mission_names_the_fields_of_view_of_its_sensors():
-    found = mission.make_mission(CONFIG).fields_of_view
-    assert found == {"camera": pytest.approx(80, abs=0.1), "lidar": 240.0}
 
 
 @pytest.mark.slow  # compiles the programs of missions

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import jax
 import pytest
 from matplotlib.figure import Figure
-from recordings import CONFIG, FIELDS_OF_VIEW, FUSION, recording
+from recordings import CONFIG, FUSION, recording
 from summaries import CASE, SUMMARY
 
 import jaxsense
@@ -24,7 +24,7 @@ def run(tmp_path_factory):
     path.mkdir()
     for name in ("latent_space", "reward"):
         (path / f"{name}.svg").write_bytes(drawing.svg(Figure(figsize=(8, 4))))
-    (drawn,) = film.draw(CONFIG, {"latent policy": recording()}, FUSION, FIELDS_OF_VIEW)
+    (drawn,) = film.draw(CONFIG, {"latent policy": recording()}, FUSION)
     (path / "mission.svg").write_text(drawn)
     found = {**SUMMARY, "commit": "0123abc"}
     (path / "report.html").write_text(page.render(path, CONFIG, found), encoding="utf-8")

@@ -58,7 +58,7 @@ def test_the_film_is_named_after_the_policy_that_it_shows(monkeypatch):
     draw = lambda config, missions, *_: drawn.append(missions) or [""] * len(missions)  # noqa: E731
     monkeypatch.setattr(drawing.film, "draw", draw)
     monkeypatch.setattr(drawing.plots, "policies", lambda block: Figure())
-    learned = SimpleNamespace(models=SimpleNamespace(fusion=None), fields_of_view=None)
+    learned = SimpleNamespace(models=SimpleNamespace(fusion=None))
     own = {"naive_2": "own"}
     films = ["mission.svg", "mission-naive.svg"]
     for recordings in (own, {**own, "naive": "other"}):

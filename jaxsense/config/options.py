@@ -13,7 +13,17 @@ import sys
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    NoReturn,
+    TypeVar,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from jaxsense.config.section import ConfigError
 from jaxsense.config.whole import Config
@@ -117,16 +127,14 @@ def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
     return dict(fields)
 
 
-class Name(str):
-    """Annotates a field that is not the option `--FIELD` on the command line.
-
-    `Name("RUN")` is a positional argument, `Name("--")` a section whose options have no prefix.
-    """
+_POSITIONAL = "positional"
+Positional = Annotated[T, _POSITIONAL]
+"""A field that is a positional argument of the command line, not the option `--FIELD`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """A command-line option, or the positional argument.
+    """A command-line option, or a positional argument.
 
     Attributes:
       path: fields and keys that lead to its value, with dots between them.
@@ -157,40 +165,28 @@ class Option:
         return inner[0], "*" if ... in inner else len(inner)
 
     @property
-    def off(self) -> str:
-        """The option that sets False, such as `--mdp.no-partly-seen-starts`."""
-        return re.sub(r"^(.*\.|--)", r"\1no-", self.name)
-
-    @property
     def help(self) -> str:
         """The description of the field, or of the dictionary with this entry, and the default."""
         known, value = docs(self.section), self.default
         text = next((known[field] for field in self.path.split(".")[::-1] if field in known), "")
-        if value is True:
-            text += f" (default: on; {self.off} turns it off)"
-        elif value is not False and value not in (None, (), dataclasses.MISSING):
+        if value not in (None, False, (), dataclasses.MISSING):
             words = shlex.join(map(str, value)) if isinstance(value, tuple) else value
-            text += f" (default: {words})"
+            text += f" (default: {'on' if value is True else words})"
         return text.replace("`", "").replace("%", "%%")
 
     def declare(self, parser: argparse._ActionsContainer) -> None:
         """Adds it to a parser, whose result has its words or truth value under its path."""
         kind, number = self.words
-        how: dict[str, Any] = {"dest": self.path, "default": argparse.SUPPRESS}
+        is_named = self.name.startswith("--")
+        how: dict[str, Any] = {"dest": self.path, "default": argparse.SUPPRESS, "help": self.help}
         if kind is bool:
-            parser.add_argument(self.name, action="store_true", help=self.help, **how)
-            off = {**how, "help": argparse.SUPPRESS}
-            parser.add_argument(self.off, action="store_false", **off)
-            return
-        if not self.name.startswith("-"):
-            number = number or "?"  # `read` names it if it is missing
-            how = {"default": argparse.SUPPRESS, "metavar": self.name, "nargs": number}
-            parser.add_argument(self.path, help=self.help, **how)
-            return
-        names: dict[object, str] = {int: "INT", float: "NUMBER", Path: "PATH"}
-        shown = f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else None
-        how |= {"metavar": shown or names.get(kind, "NAME"), "nargs": number}
-        parser.add_argument(self.name, help=self.help, **how)
+            how["action"] = argparse.BooleanOptionalAction
+        else:
+            names: dict[object, str] = {int: "INT", float: "NUMBER", Path: "PATH"}
+            shown = f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else None
+            how["metavar"] = (shown or names.get(kind, "NAME")) if is_named else self.name
+            how["nargs"] = number if is_named else number or "?"  # `read` tells if it is missing
+        parser.add_argument(*[self.name] * is_named, **how)
 
     def value(self, found: bool | str | list[str]) -> object:
         """Reads what is given. Words of another type stay text, which the dataclass refuses."""
@@ -203,27 +199,33 @@ class Option:
         return values if isinstance(found, list) else values[0]
 
 
-def options_of(base: object, name: str = "--", path: str = "") -> Iterator[Option]:
-    """All options of a dataclass, an instance or else the class, which holds their defaults."""
+def options_of(base: object, path: str = "", place: str | None = None) -> Iterator[Option]:
+    """All options of a dataclass, an instance or else the class, which holds their defaults.
+
+    Args:
+      base: the dataclass; the `PLACE` of a `Checked` one is the prefix of its options.
+      path: fields and keys that lead to it.
+      place: another prefix.
+    """
     section = base if isinstance(base, type) else type(base)
+    place = getattr(section, "PLACE", "") if place is None else place
     kinds, marked = get_type_hints(section), get_type_hints(section, include_extras=True)
-    prefix = name if name == "--" else f"{name}."
     for field in (each.name for each in dataclasses.fields(cast(Any, section))):
         default = getattr(base, field, dataclasses.MISSING)
-        own = next((mark for mark in get_args(marked[field]) if isinstance(mark, Name)), None)
-        inside, to = own or prefix + field.replace("_", "-"), f"{path}.{field}".lstrip(".")
+        to, inside = f"{path}.{field}".lstrip("."), f"{place}.{field}".lstrip(".")
+        is_positional = _POSITIONAL in get_args(marked[field])
+        name = field.upper() if is_positional else f"--{inside.replace('_', '-')}"
         if dataclasses.is_dataclass(default):
-            yield from options_of(default, inside, to)
+            yield from options_of(default, to)
         elif isinstance(default, Mapping):
-            kind = get_args(kinds[field])[1]
             for key, each in default.items():
-                entry = f"{inside}.{key.replace('_', '-')}"
                 if dataclasses.is_dataclass(each):
-                    yield from options_of(each, entry, f"{to}.{key}")
+                    yield from options_of(each, f"{to}.{key}", f"{inside}.{key}")
                 else:
-                    yield Option(f"{to}.{key}", entry, kind, each, section)
+                    entry = f"{name}.{key.replace('_', '-')}"
+                    yield Option(f"{to}.{key}", entry, get_args(kinds[field])[1], each, section)
         else:
-            yield Option(to, inside, kinds[field], default, section)
+            yield Option(to, name, kinds[field], default, section)
 
 
 class _Parser(argparse.ArgumentParser):

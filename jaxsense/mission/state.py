@@ -207,11 +207,6 @@ class Mission:
         return dataclasses.replace(self, policies=FrozenDict(left))
 
     @property
-    def fields_of_view(self) -> dict[str, float]:
-        """Of each sensor, by its name, in degrees."""
-        return {sensor.name: sensor.field_of_view for sensor in self.world.sensors}
-
-    @property
     def modalities(self) -> Int[Array, " R"]:
         """Index of each robot's sensor, int32."""
         return jnp.array(self.config.modality_of_robot)

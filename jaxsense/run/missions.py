@@ -13,19 +13,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Int, PyTree
 
 from jaxsense.config import Config
-from jaxsense.config.mission import CONTROL_PERIOD, NODES_PER_POI, VIEW_SIDES
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core.types import Key, pytree
 from jaxsense.mission import Case, Mission, MissionState, Record, make_mission, reset
-from jaxsense.mission.maps import MOST_LOOKS
 from jaxsense.mission.outcome import measure
-from jaxsense.mission.roadmap import VIEW_DISTANCES
 from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.models import Models, init
 from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
-from jaxsense.run.monitor import StageError
+from jaxsense.run.monitor import StageError, is_finite
 
 Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
 
@@ -34,9 +32,9 @@ _SECOND = "naive"  # whose first mission is recorded as well as that of the firs
 _RECORDED = 2  # missions at a time on each device, in its first slots
 CHUNK = math.ceil(2.5 / CONTROL_PERIOD)
 """Control periods between two reports."""
-# Missions side by side on each thread of a CPU or on each accelerator.
-_LEAST_OF_CPU, _MOST_OF_CPU, _CACHE = 8, 192, 2**26  # bytes
-_MOST_OF_ACCELERATOR, _SHARE_OF_MEMORY = 32768, 0.05
+# Missions side by side: what the caches of a thread of a CPU hold, and on each accelerator.
+_MOST_OF_CPU, _MOST_OF_ACCELERATOR = 192, 32768
+_BYTES_EACH = 2**20  # of an accelerator's memory, most of it for the physics
 # A control step of so many missions takes an accelerator twice as long as that of a few. With T
 # missions, B of which play at once, the time is about (T / B + 1) * (1 + B / this): B squared is
 # this times T at its minimum.
@@ -44,30 +42,16 @@ _AS_LONG_AS_NONE = 8192
 _MANY_POIS = 2**14  # of all missions that take longer to play than faster programs to compile
 
 
-def batch_of(config: Config, total: int, workers: Workers = ALONE) -> int:
-    """Number of missions side by side, below `total` since some missions last long.
+def batch_of(total: int, workers: Workers = ALONE) -> int:
+    """Number of missions side by side: the more there are, the more pay on an accelerator.
 
-    A CPU holds them in its caches, an accelerator in a small part of its memory, and more the more
-    there are.
+    Some missions last long, so that a CPU is at work to the end with a third of them.
     """
     memory = devices.memory()
     if memory is None:
-        most = min(_MOST_OF_CPU, max(_LEAST_OF_CPU, _CACHE // _bytes_of_state(config)))
-        return min(most * workers.number, -(-total // 3))
-    share = max(1, int(_SHARE_OF_MEMORY * memory) // _bytes_of_state(config))
+        return min(_MOST_OF_CPU * workers.number, -(-total // 3))
     pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
-    return min(total, pays, min(_MOST_OF_ACCELERATOR, share) * workers.number)
-
-
-def _bytes_of_state(config: Config) -> int:
-    """Approximate size of a mission's state: its roadmap, its robots' maps and some more."""
-    robots, num_classes = len(config.carried), len(config.arena.classes)
-    views = config.arena.num_pois * VIEW_SIDES * len(VIEW_DISTANCES)
-    nodes = config.arena.num_pois * NODES_PER_POI
-    numbers = nodes * (nodes + robots)
-    if config.mission.communication.own_maps:
-        numbers += robots * MOST_LOOKS * (robots + 2 * num_classes)
-    return 2**13 + 4 * numbers + nodes * views
+    return min(total, pays, min(_MOST_OF_ACCELERATOR, memory // _BYTES_EACH) * workers.number)
 
 
 @pytree
@@ -212,7 +196,7 @@ class Player:
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
         config, key, mesh = mission.config, jax.random.key(0), workers.mesh
-        batch = max(batch_of(config, total, workers), min(total, _RECORDED * workers.number))
+        batch = max(batch_of(total, workers), min(total, _RECORDED * workers.number))
         self._share = -(-batch // workers.number)
         self._recorded = min(_RECORDED, self._share)
         self.batch = self._share * workers.number
@@ -246,7 +230,8 @@ class Player:
             take for the end of the mission, or if a policy's values are NaN.
           Stopped: if the run was asked to stop.
         """
-        self._monitor.check_finite(_STAGE, "models", models)
+        if not is_finite(models):
+            raise StageError(f"{_STAGE}: models are not finite")
         self.wait()
         config, number, threads = self.mission.config, self._workers.number, self._workers.threads
         total = episodes * len(played)

@@ -112,11 +112,6 @@ class Monitor:
         with self._lock:
             self._listener(stage, done, total, metrics)
 
-    def check_finite(self, stage: str, name: str, values: PyTree) -> None:
-        """Raises `StageError` with the stage and the name of values if any is not finite."""
-        if not is_finite(values):
-            raise StageError(f"{stage}: {name} are not finite")
-
     def report(
         self, stage: str, done: int, total: int, losses: np.ndarray, **metrics: float
     ) -> None:

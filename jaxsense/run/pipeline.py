@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import mission
-from jaxsense.config import Config
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
 from jaxsense.run.files import UNFINISHED, Checkpoints
-from jaxsense.run.monitor import Monitor, StageError, Stopped
+from jaxsense.run.monitor import Monitor, StageError, Stopped, is_finite
 from jaxsense.run.programs import Programs
+from jaxsense.sim import sensors
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, learners
@@ -51,7 +51,6 @@ class Learned:
       models: the trained networks.
       windows: for each modality `[C, window, channels]` one look at each class, from left to right.
       reliability: for each modality, see `training.measures.reliability`.
-      fields_of_view: of each sensor, by modality, in degrees.
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
       rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
         of the episodes that ended, `reward`, and of the learned policy of a robot that is alone on
@@ -61,24 +60,16 @@ class Learned:
 
     models: Models
     windows: dict[str, np.ndarray]
-    fields_of_view: dict[str, float]
     reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
     results: blocks.Learned
 
 
-def learn(
-    key: Key,
-    config: Config,
-    programs: Programs,
-    monitor: Monitor,
-    checkpoints: Checkpoints,
-) -> Learned:
+def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
     """Trains everything and summarises it; see `train`."""
-    trained = train(key, config, programs, monitor, checkpoints)
+    config, trained = programs.config, train(key, programs, checkpoints)
     outputs, curves = trained.outputs, trained.curves
-    scenario = monitor.wait_for(programs.player).mission
     posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
     beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
@@ -101,9 +92,8 @@ def learn(
         models=stages.models(outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
-            for sensor, windows in zip(scenario.world.sensors, detections.windows, strict=True)
+            for sensor, windows in zip(sensors.make(config), detections.windows, strict=True)
         },
-        fields_of_view=scenario.fields_of_view,
         reliability=reliability(config, detections.held_out),
         posteriors=posteriors,
         rewards={
@@ -125,35 +115,27 @@ def learn(
 
 
 def play(
-    key: Key,
-    config: Config,
-    programs: Programs,
-    learned: Learned,
-    checkpoints: Checkpoints,
+    key: Key, programs: Programs, learned: Learned, checkpoints: Checkpoints
 ) -> tuple[missions.Played, blocks.Missions]:
     """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 
     Raises:
       StageError, Stopped: see `missions.Player.play`.
     """
-    player, episodes = programs.player.result(), config.mission.episodes
-    cases = mission.cases(config, player.mission.policies)
-    of_run = {name: cases[name] for name in config.mission.policies}
-    played = player.play(stages.mission_key(key), learned.models, of_run, episodes)
+    player, settings = programs.player.result(), programs.config.mission
+    cases = mission.cases(programs.config, player.mission.policies)
+    of_run = {name: cases[name] for name in settings.policies}
+    played = player.play(stages.mission_key(key), learned.models, of_run, settings.episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
-    return played, make.missions(config, played.metrics)
+    return played, make.missions(programs.config, played.metrics)
 
 
-def train(
-    key: Key, config: Config, programs: Programs, monitor: Monitor, checkpoints: Checkpoints
-) -> Trained:
+def train(key: Key, programs: Programs, checkpoints: Checkpoints) -> Trained:
     """Runs all stages; independent ones run side by side.
 
     Args:
       key: the only source of randomness.
-      config: all settings; its `Traced` fields are inputs of the programs.
-      programs: of the stages.
-      monitor: receives time and progress.
+      programs: of the stages, with the settings; their monitor receives time and progress.
       checkpoints: where to save. Stages found there, which must come from the same key and
         settings, are not trained again.
 
@@ -163,7 +145,7 @@ def train(
       Stopped: if the monitor was asked to stop; trainings under way are saved.
       OSError: if a checkpoint cannot be written.
     """
-    training = _Training(key, config, programs, monitor, checkpoints)
+    training = _Training(key, programs, checkpoints)
     outputs = dict[str, Future[Output]]()
     with ThreadPoolExecutor(_MAX_THREADS, "stage") as threads:
         running = set[Future[None]]()
@@ -173,12 +155,12 @@ def train(
             running.add(threads.submit(training.run, stage, inputs, output))
             return output
 
-        stages.train(drive, config)
+        stages.train(drive, programs.config)
         kept = {name: x for name, x in outputs.items() if name not in _ONLY_PASSED_ON}
         outputs.clear()
         for _ in as_completed(running):
             devices.give_back_freed()
-    monitor.check_stop()
+    programs.monitor.check_stop()
     return Trained({name: output.result() for name, output in kept.items()}, training.curves)
 
 
@@ -187,9 +169,7 @@ class _Training:
     """What the stages of a training share."""
 
     key: Key
-    config: Config
     programs: Programs
-    monitor: Monitor
     checkpoints: Checkpoints
     curves: dict[str, Curves] = dataclasses.field(default_factory=dict)
 
@@ -210,7 +190,7 @@ class _Training:
                 self.checkpoints.save(stage.name, found)
         except BaseException as error:
             if not isinstance(error, Stopped):
-                self.monitor.fail(error)
+                self.programs.monitor.fail(error)
             with contextlib.suppress(InvalidStateError):  # it could not be saved
                 output.set_exception(error)
         finally:
@@ -219,25 +199,26 @@ class _Training:
     def _execute(self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]]) -> Output:
         """The output of a stage that was not saved."""
         given = jax.tree.map(lambda x: x.result() if isinstance(x, Future) else x, inputs)
-        self.monitor.check_stop()
+        self.programs.monitor.check_stop()
         output = (self._train if stage.chunks else self._once)(stage, given)
-        if not stage.is_optional:
-            self.monitor.check_finite(stage.name, "results", output)
+        if not (stage.is_optional or is_finite(output)):
+            raise StageError(f"{stage.name}: results are not finite")
         return output
 
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The first state."""
-        return self.programs.of(stage).begin(stage.key(self.key), self.config, inputs)
+        return self.programs.of(stage).begin(stage.key(self.key), self.programs.config, inputs)
 
     def _once(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage without steps."""
-        output = stage.finish(self.config, self._begin(stage, inputs), **inputs)
+        output = stage.finish(self.programs.config, self._begin(stage, inputs), **inputs)
         # Joined rows lie on the host, and every program would transfer them again.
         return jax.device_put(output)
 
     def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage with steps."""
-        programs, config, keys = self.programs.of(stage), self.config, stage.chunk_keys(self.key)
+        programs, config = self.programs.of(stage), self.programs.config
+        keys = stage.chunk_keys(self.key)
         # The rate must not include compilation.
         programs.advance.wait()
 
@@ -254,13 +235,13 @@ class _Training:
                 self._begin(stage, inputs),
                 self._no_curves(stage),
                 advance,
-                self.monitor,
+                self.programs.monitor,
                 self.checkpoints,
             )
         except StageError as error:
             if not stage.is_optional:
                 raise
-            self.monitor.warn(f"{error}: left out")
+            self.programs.monitor.warn(f"{error}: left out")
             self.curves[stage.name] = self._no_curves(stage)
             return _failed(programs.shapes.result().output)
         return programs.finish(config, state, inputs)
@@ -277,7 +258,7 @@ class _Training:
             for name, values in metrics.items()
             if np.isfinite(values).any()
         }
-        self.monitor.report(stage.name, done, stage.steps, losses, **means)
+        self.programs.monitor.report(stage.name, done, stage.steps, losses, **means)
         return metrics
 
     def _load(self, stage: Stage) -> Output:

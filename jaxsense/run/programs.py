@@ -64,7 +64,7 @@ class StagePrograms:
 
 
 class Programs:
-    """Compiled programs of runs whose settings differ only in their leaves."""
+    """Compiled programs of the runs of one or several seeds."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Programs:
           trainings: number after whose last call a program is released; 0 for never.
           policies: of missions, by name, in addition to `dqn.POLICIES`.
         """
-        self.config, self.stages = config, stages.stages(config)
+        self.config, self.stages, self.monitor = config, stages.stages(config), compiler.monitor
         self.player: Future[missions.Player] = Future()
         self._compiler, self._workers, self._policies = compiler, workers, policies
         names = [stage.program for stage in self.stages]
@@ -125,7 +125,7 @@ class Programs:
 
     def _compile_missions(self) -> None:
         config = self.config
-        with self._compiler.monitor.measure("compile_s", "mission"):
+        with self.monitor.measure("compile_s", "mission"):
             scenario = mission.make_mission(config, self._policies)
             scenario = scenario.playing(config.mission.policies)
         number = len(config.mission.policies) * config.mission.episodes

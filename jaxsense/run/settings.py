@@ -5,10 +5,10 @@ import json
 import os
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TypeAlias
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
-from jaxsense.config.options import Name, parse_json
+from jaxsense.config.options import parse_json
 from jaxsense.config.section import Checked, limited, require
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
@@ -33,7 +33,7 @@ class Settings(Checked):
 
     preset: str = "default"
     seed: int = limited(0, at_least=0, at_most=MAX_SEED)
-    config: Annotated[Config, Name("--")] = Config()
+    config: Config = Config()
     num_seeds: int = limited(1, at_least=1, at_most=10_000)
 
     def check(self) -> None:

@@ -46,7 +46,7 @@ def of_training(config: Config, learned: Learned) -> Pictures:
 def of_missions(config: Config, learned: Learned, played: Played, block: Missions) -> Pictures:
     """The plot of missions and the film of one, also under naive exploration."""
     missions = {f"{name} policy": each for name, each in played.recordings.items()}
-    films = film.draw(config, missions, learned.models.fusion, learned.fields_of_view)
+    films = film.draw(config, missions, learned.models.fusion)
     names = (f"{name}.svg" for name in page.OWN_FILMS)
     return {
         "policies.svg": svg(plots.policies(block)),

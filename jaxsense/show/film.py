@@ -22,6 +22,7 @@ from jaxsense.mission.state import ENDED, FACING
 from jaxsense.run.missions import Recording
 from jaxsense.show.colours import class_colour, in_plane, modality_colour, plane
 from jaxsense.show.svg import Timeline, add, smooth
+from jaxsense.sim import sensors
 
 _SIZE = 340  # px, side of a view
 _WIDTH, _TOP, _LINE = 2 * _SIZE + 40, 38, 26
@@ -51,7 +52,6 @@ class _Scene:
       config: all settings.
       end: the state in which the mission ended.
       fusion: of the map.
-      fields_of_view: of each sensor, by its name, in degrees.
       record: `[F]` frames of the mission.
       probabilities: `[F, N, C]` of the classes, in the map.
       timeline: when the frames are shown.
@@ -60,7 +60,6 @@ class _Scene:
     config: Config
     end: MissionState
     fusion: Fusion
-    fields_of_view: Mapping[str, float]
     record: Record
     probabilities: np.ndarray
     timeline: Timeline
@@ -81,38 +80,22 @@ class _Scene:
         return _SIZE / 2 + self.scale * np.asarray(position)[..., :2] * (1, -1)
 
 
-def draw(
-    config: Config,
-    recordings: Mapping[str, Recording],
-    fusion: Fusion,
-    fields_of_view: Mapping[str, float],
-) -> list[str]:
+def draw(config: Config, recordings: Mapping[str, Recording], fusion: Fusion) -> list[str]:
     """Draws missions as animated SVGs, which last equally long.
 
     Args:
       config: all settings.
       recordings: of the missions, by their titles.
       fusion: of the map, whose prior and classes are shown in it.
-      fields_of_view: of each sensor, by its name, in degrees.
 
     Returns:
       The content of each file.
     """
     last = max(int(each.end.steps) for each in recordings.values())
-    return [
-        _draw(config, each, fusion, fields_of_view, title, last)
-        for title, each in recordings.items()
-    ]
+    return [_draw(config, each, fusion, title, last) for title, each in recordings.items()]
 
 
-def _draw(
-    config: Config,
-    recording: Recording,
-    fusion: Fusion,
-    fields_of_view: Mapping[str, float],
-    title: str,
-    last: int,
-) -> str:
+def _draw(config: Config, recording: Recording, fusion: Fusion, title: str, last: int) -> str:
     """Draws a mission for as long as one of `last` control periods."""
     end, seconds = recording.end, CONTROL_PERIOD * int(recording.end.steps)
     record = _frames(config, recording.records, fusion.prior, last)
@@ -131,7 +114,7 @@ def _draw(
     add(root, "title", text)
     timeline = Timeline(shown / duration, add(root, "style", _STYLE))
     probabilities = np.asarray(jax.vmap(jax.vmap(fusion.class_probabilities))(record.belief))
-    scene = _Scene(config, end, fusion, fields_of_view, record, probabilities, timeline)
+    scene = _Scene(config, end, fusion, record, probabilities, timeline)
     add(root, "rect", class_="film-paper", width=_WIDTH, height=height)
     halves = []
     for place, name in ((10, title), (30 + _SIZE, "the shared map")):
@@ -280,8 +263,8 @@ def _draw_robot(parent: Element, fields: Element, scene: _Scene, r: int) -> None
         scene.timeline.animate(moved[-1], "rotate", angles)
     field, body = moved
     reach = scene.scale * config.navigation.view_range
-    sector = _sector(reach, scene.fields_of_view[config.carried[r]])
-    view = add(field, "path", d=sector, fill=colour)
+    sensor = sensors.make(config)[config.modality_of_robot[r]]
+    view = add(field, "path", d=_sector(reach, sensor.field_of_view), fill=colour)
     is_blind = (record.phase[:, r] >= ENDED) | (record.time >= scene.end.faults.blind_at[r])
     opacity = np.where(record.phase[:, r] == FACING, 0.34, 0.16)
     scene.timeline.animate(view, "opacity", np.where(is_blind, 0.0, opacity), jumps=True)

@@ -66,7 +66,7 @@ def test_any_command_line_is_read_or_refused_in_one_line(
     parse, base = PARSE[command]
     known = [option for option in options.options_of(base) if option.name.startswith("-")]
     names = [option.name for option in known] or ["--seed"]
-    names += [option.off for option in known if option.kind is bool]
+    names += [f"--no-{option.name[2:]}" for option in known if option.kind is bool]
     read = 0
     for _ in range(lines // len(PARSE)):
         argv = line_of(draw, names)

@@ -3,13 +3,13 @@
 import dataclasses
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import pytest
 
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError, Shape, options
-from jaxsense.config.options import Name
+from jaxsense.config.options import Positional
 from jaxsense.run.rundir import RunDirectory, Settings
 
 
@@ -42,8 +42,8 @@ class Ship:
       night: Whether to sail at night.
     """
 
-    port: Annotated[str, Name("PORT")]
-    stops: Annotated[tuple[str, ...], Name("STOPS")] = ()
+    port: Positional[str]
+    stops: Positional[tuple[str, ...]] = ()
     sail: Sail = dataclasses.field(default=Sail())
     size: tuple[int, int] = (3, 1)
     kind: Literal["brig", "yawl"] = "brig"
@@ -72,11 +72,10 @@ options:
       Its log book.
   --crew INT
       Number of people, if it is known.
-  --engine
+  --engine, --no-engine
       Whether to use the engine.
-      (default: on; --no-engine turns it
-      off)
-  --night
+      (default: on)
+  --night, --no-night
       Whether to sail at night.
 
 sail:
@@ -139,7 +138,7 @@ def test_words_are_read_in_the_types_of_the_fields(line, changes):
         ("", "option = 'PORT': is missing: The port to leave."),
         ("Rome --size 4", "option = '--size': expected 2 arguments"),
         ("Rome --crew", "option = '--crew': expected one argument"),
-        ("Rome --night=1", "option = '--night': ignored explicit argument '1'"),
+        ("Rome --night=1", "option = '--night/--no-night': ignored explicit argument '1'"),
         ("Rome --crwe 3", "option = '--crwe': is unknown; did you mean --crew?"),
         ("Rome --sail.are 3", "option = '--sail.are': is unknown; did you mean --sail.area?"),
         (f"Rome --{300 * 'x'}", f"{197 * 'x'}...: is unknown; see --help-all"),

@@ -57,7 +57,7 @@ def toy(replace_training, tmp_path):
         path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
         checkpoints = Checkpoints(path, warned.append)
         with Compiler(monitor) as compiler:
-            found = pipeline.train(KEY, SMOKE, Programs(SMOKE, compiler), monitor, checkpoints)
+            found = pipeline.train(KEY, Programs(SMOKE, compiler), checkpoints)
         return found, [report for report in heard if report[2]], warned
 
     return train
@@ -154,9 +154,9 @@ def test_programs_are_let_go_of_once_no_training_needs_them(collect, replace_tra
         assert shared is compiled.of(kinds[1])
         every = [shared.advance, compiled.of(kinds[2]).finish]
         alive = [weakref.ref(program.wait()) for program in every]
-        pipeline.train(KEY, SMOKE, compiled, monitor, Checkpoints(tmp_path / "first"))
+        pipeline.train(KEY, compiled, Checkpoints(tmp_path / "first"))
         assert all(program() is not None for program in alive)
-        pipeline.train(KEY, SMOKE, compiled, monitor, Checkpoints(tmp_path / "second"))
+        pipeline.train(KEY, compiled, Checkpoints(tmp_path / "second"))
         collect()
         assert all(program() is None for program in alive)
         with pytest.raises(RuntimeError, match="advance of dqn was released"):
@@ -232,7 +232,7 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
         if stage.name == "full":
             raise OSError(28, "No space left on device")
         for _ in range(1000):
-            if self.monitor.is_stopping:
+            if self.programs.monitor.is_stopping:
                 return begin(self, stage, inputs)
             time.sleep(0.01)
         raise AssertionError("it was not stopped")

@@ -3,7 +3,6 @@
 from concurrent.futures import Future
 from threading import Timer
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -30,13 +29,6 @@ def test_the_first_step_with_a_loss_that_is_not_finite_is_named(value):
     losses = np.array([1.0, 1.0, value, np.nan])
     with pytest.raises(StageError, match=rf"dqn_camera: loss = {value} at step 7 of 12"):
         Monitor().report("dqn_camera", 8, 12, losses)
-
-
-def test_what_is_not_finite_is_named():
-    monitor, bad = Monitor(), {"a": jnp.ones(2), "b": jnp.array([0.0, jnp.nan])}
-    monitor.check_finite("jmvae", "weights", {"a": jnp.ones(2), "b": jnp.zeros(3)})
-    with pytest.raises(StageError, match="jmvae: weights are not finite"):
-        monitor.check_finite("jmvae", "weights", bad)
 
 
 def test_another_run_has_a_listener_of_its_own():

@@ -23,7 +23,7 @@ def test_learn_and_a_run_come_to_the_same(monkeypatch, tmp_path):
     monitor = Monitor()
     with Compiler(monitor) as compiler:
         programs = Programs(config, compiler)
-        found = pipeline.train(KEY, config, programs, monitor, Checkpoints(tmp_path))
+        found = pipeline.train(KEY, programs, Checkpoints(tmp_path))
     # A few steps, after which rounding has not yet made learning part ways.
     learned = jax.jit(lambda key: learn(key, config))(KEY)
     assert bool(learned.is_finite)
