@@ -173,11 +173,11 @@ def surveys(
     classes: Int[Array, "S N"],
     is_empty: Bool[Array, " S"] | None = None,
     places: Key | None = None,
-) -> tuple[Scene, tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
+) -> tuple[tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
     """Surveys many scenes, see `sim.world.survey`.
 
     Returns:
-      `[S]` scenes, for each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
+      For each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
     """
     number = len(keys)
     chunk = min(_SCENES_AT_ONCE, number)
@@ -281,7 +281,7 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     def look(key: Key, world: World, models: Models) -> Samples:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
-        _, seen, distances = surveys(jax.random.split(survey_key, number), world, classes)
+        seen, distances = surveys(jax.random.split(survey_key, number), world, classes)
         found = features(models.detectors, seen, distances)
         return tuple(by_class(x, classes, num_classes, samples) for x in found)
 

@@ -197,7 +197,7 @@ def survey(
     classes: Int[Array, "N"],
     is_empty: Bool[Array, ""] | None = None,
     places: Key | None = None,
-) -> tuple[Scene, tuple[Float[Array, "N _"], ...], Float[Array, "R N"]]:
+) -> tuple[tuple[Float[Array, "N _"], ...], Float[Array, "R N"]]:
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
@@ -205,8 +205,8 @@ def survey(
       places: see `random_scene`.
 
     Returns:
-      The scene, for each robot the inputs of its detector, one per PoI, and the expected distances
-      of the PoIs, in metres.
+      For each robot the inputs of its detector, one per PoI, and the expected distances of the
+      PoIs, in metres.
     """
     checks.require_key(key)
     scene_key, viewpoint_key, noise_key = jax.random.split(key, 3)
@@ -243,7 +243,7 @@ def survey(
 
         return jax.vmap(read)(noise_keys[robot], jax.tree.map(lambda x: x[robot], views))
 
-    return scene, tuple(map(read_all, range(len(world.sensors)))), views.distance
+    return tuple(map(read_all, range(len(world.sensors)))), views.distance
 
 
 def _believed(

@@ -12,20 +12,18 @@ from jaxtyping import Array, Int
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Belief, Fusion, Key, Novelty
-from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Environment, Underway
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.team import alone
 from jaxsense.dqn.training import DqnState
 from jaxsense.looks import Bank, Live, make_mdp
 from jaxsense.models import make_agent, make_bayes, make_prior
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
 from jaxsense.training.comparison import held_out_mdp, models_of
-from jaxsense.training.detections import Detections, Starts
+from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Drive, Output, Progress, Stage
 from jaxsense.vae import readout
 from jaxsense.vae.detectors import Detector
@@ -129,13 +127,8 @@ def _starts(
     learn_key, held_out_key = jax.random.split(key)
     learning = _environment(config, jnp.int32(0), detections, **given)
     held_out = held_out_mdp(config, given["fusion"], detections, jnp.int32(0))
-    surveyed, number = detections.starts, config.dqn.num_starts
-    begun = (
-        _surveyed_starts(learn_key, learning, surveyed, number)
-        if len(surveyed.classes)
-        else dqn.starts(learn_key, learning, config.dqn)
-    )
-    return begun, comparison.evaluation_starts(held_out_key, held_out, config)
+    prepared = dqn.starts(learn_key, learning, config.dqn)
+    return prepared, comparison.evaluation_starts(held_out_key, held_out, config)
 
 
 def _begin(
@@ -184,17 +177,3 @@ def learner(config: Config, modality: str) -> str:
 def learners(config: Config) -> tuple[str, ...]:
     """Names of all stages that train Q-networks, in the order of `Models.q_networks`."""
     return tuple(dict.fromkeys(learner(config, modality) for modality in config.modalities))
-
-
-def _surveyed_starts(key: Key, learning: Environment, starts: Starts, number: int) -> Underway:
-    """First states in surveyed scenes, `[number]`, with looks from the surveys."""
-    mdp = learning.mdp
-    team = alone(mdp.num_pois, mdp.robots[0])
-
-    def begin(key: Key, starts: Starts) -> Underway:
-        seen_key, begin_key = jax.random.split(key)
-        _, seen = mdps.random_start(seen_key, mdp)
-        of_survey = starts.scenes, starts.classes, seen, starts.features
-        return learning.begin(mdps.begin(begin_key, mdp, team, *of_survey))
-
-    return jax.vmap(begin)(jax.random.split(key, number), starts)

@@ -20,7 +20,7 @@ from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.models import make_bayes, make_detector
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
-from jaxsense.sim.world import Scene, make_world
+from jaxsense.sim.world import make_world
 from jaxsense.training.stage import Fit, Output, Stage, fit_stage
 from jaxsense.vae import detectors, novelty
 from jaxsense.vae.detectors import Classifier, Detector, Looks
@@ -41,13 +41,11 @@ class Survey:
 
     Attributes:
       classes: `[S, N]` int32 true classes.
-      scenes: `[S]` scenes.
       windows: for each modality `[S, N, F]` inputs of its detector.
       distances: `[S, M, N]` expected distances of the PoIs, in metres.
     """
 
     classes: Int[Array, "S N"]
-    scenes: Scene
     windows: tuple[Float[Array, "S N F"], ...]
     distances: Float[Array, "S M N"]
 
@@ -88,7 +86,7 @@ def num_scenes(config: Config) -> tuple[int, int, int, int]:
         -(-each * len(config.arena.classes) // num_pois)
         for each in (config.jmvae.samples_per_class, held_out_per_class(config))
     )
-    parts = num_train, max(num_bank, num_starts(config) * together), num_held_out
+    parts = num_train, num_bank, num_held_out
     # Whole groups of scenes that show the same PoIs.
     training, bank, held_out = (-(-number // together) * together for number in parts)
     return training, bank, held_out, -(-num_train // _SHARE_OF_EMPTY)
@@ -104,11 +102,6 @@ def num_training(config: Config) -> int:
     together, num_pois = config.jmvae.num_together, config.arena.num_pois
     group = 1 if together == 1 else together * num_pois
     return group * config.detector.num_training(num_scenes(config)[0] * num_pois // group)
-
-
-def num_starts(config: Config) -> int:
-    """Number of surveyed scenes in which episodes start; 0 unless looks are live."""
-    return config.dqn.num_starts if config.dqn.observe == "live" else 0
 
 
 Scenes = tuple[Key, Int[Array, "S N"], Bool[Array, " S"], Key | None]
@@ -147,30 +140,13 @@ def survey(key: Key, config: Config, *, scenes: Scenes) -> Survey:
     """
     del key
     keys, classes, is_empty, places = scenes
-    world = make_world(config)
-    seen, windows, distances = looks.surveys(keys, world, classes, is_empty, places)
-    return Survey(classes, seen, windows, distances)
+    return Survey(classes, *looks.surveys(keys, make_world(config), classes, is_empty, places))
 
 
 def divide(config: Config, survey: Survey, **_: Scenes) -> Surveys:
     """Divides the survey of all scenes by what it is for."""
     ends = itertools.accumulate(num_scenes(config), initial=0)
     return Surveys(*(survey.of_scenes(slice(*part)) for part in itertools.pairwise(ends)))
-
-
-@pytree
-class Starts:
-    """First scenes of episodes, and looks at their PoIs.
-
-    Attributes:
-      classes: `[S, N]` int32 true classes.
-      scenes: `[S]` scenes.
-      features: for each modality `[S, N, D_m]`.
-    """
-
-    classes: Int[Array, "S N"]
-    scenes: Scene
-    features: tuple[Float[Array, "S N D_m"], ...]
 
 
 @pytree
@@ -193,13 +169,11 @@ class Detections:
     Attributes:
       bank: for each modality `[C, S, D_m]` features for training.
       held_out: for each modality `[C, S', D_m]` features of other scenes, to measure on.
-      starts: where episodes start; empty unless looks are live.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
     """
 
     bank: Samples
     held_out: Samples
-    starts: Starts
     windows: tuple[Float[Array, "C 1 F"], ...]
 
 
@@ -314,14 +288,9 @@ def detect(
         return tuple(looks.by_class(x, classes, num_classes, number) for x in values)
 
     of_bank, classes = features(bank), bank.classes if shown is None else shown.bank
-    starts = Starts(bank.classes, bank.scenes, of_bank)
-    # One scene of each group: no two starts show the same PoIs.
-    together = config.jmvae.num_together
-    rows = slice(0, num_starts(config) * together, together)
     return Detections(
         bank=by_class(of_bank, classes, config.jmvae.samples_per_class),
         held_out=by_class(features(held_out), held_out.classes, held_out_per_class(config)),
-        starts=jax.tree.map(lambda x: x[rows], starts),
         windows=by_class(held_out.windows, held_out.classes, 1),
     )
 

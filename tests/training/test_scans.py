@@ -57,7 +57,7 @@ def learned():
         camera, lidar = (
             jax.random.uniform(keys[m], (*shape, n * (1, 3)[m == 0])) for m, n in enumerate(windows)
         )
-        return (), (camera, lidar), jnp.ones((shape[0], 2, shape[1]))
+        return (camera, lidar), jnp.ones((shape[0], 2, shape[1]))
 
     once = dataclasses.replace(TINY, jmvae=dataclasses.replace(TINY.jmvae, restarts=1))
     with pytest.MonkeyPatch.context() as patch:

@@ -18,7 +18,7 @@ from jaxsense.vae import detectors
 
 @pytest.fixture
 def surveys(monkeypatch) -> Survey:
-    """A survey whose windows, and scenes, hold the key that the scene was simulated with."""
+    """A survey whose windows hold the key that the scene was simulated with."""
 
     def survey(keys, world, classes, is_empty, places):
         key = jax.random.key_data(keys)[:, -1].astype(jnp.uint32)
@@ -26,7 +26,7 @@ def surveys(monkeypatch) -> Survey:
         number, num_pois = classes.shape
         # Expected at 2 m in empty scenes, and at 1 m in all others.
         distances = jnp.broadcast_to(1.0 + is_empty[:, None, None], (number, 2, num_pois))
-        return key, (windows, windows), distances
+        return (windows, windows), distances
 
     monkeypatch.setattr(looks, "surveys", survey)
     return surveys_of(scenes())
@@ -46,7 +46,6 @@ MEASURED = dataclasses.replace(
     SMOKE,
     detector=DetectorConfig(num_scans=31, num_held_out=25, steps=1),
     jmvae=JmvaeConfig(samples_per_class=10),
-    dqn=dataclasses.replace(SMOKE.dqn, observe="live", num_envs=4),
 )
 
 
@@ -55,7 +54,7 @@ def used(arrays):
 
 
 def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
-    assert len(used(surveys.scenes)) == sum(num_scenes(MEASURED))  # no key twice
+    assert len(used(surveys.windows)) == sum(num_scenes(MEASURED))  # no key twice
     trained_on, of_nothing = [], []
 
     def fit(key, state, problem, number):
@@ -77,43 +76,39 @@ def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeyp
     found = detections(KEY, MEASURED, surveys=divided, trained=(None, None))
 
     seen, bank, held_out = used(trained_on), used(found.bank), used(found.held_out)
-    starts, plotted = used(found.starts.scenes), used(found.windows)
     assert seen.isdisjoint(bank)
-    assert held_out.isdisjoint(seen | bank | starts)
-    assert starts.isdisjoint(seen)
-    assert plotted <= held_out
+    assert held_out.isdisjoint(seen | bank)
+    assert used(found.windows) <= held_out
     # All of them were looked at.
     assert len(seen) >= 31 / 3
     # And they learn from empty scenes that nothing else uses.
     is_empty = np.asarray(surveys.distances[:, 0, 0]) == 2
     assert is_empty.sum() == num_scenes(MEASURED)[3] == 2  # of 11 to train on
-    empty = used(surveys.scenes[is_empty])
-    assert empty.isdisjoint(seen | bank | held_out | starts)
+    empty = used([x[is_empty] for x in surveys.windows])
+    assert empty.isdisjoint(seen | bank | held_out)
     assert used(np.float32(list(empty))) <= used(examples[0].windows)
     assert used(of_nothing) <= used([x.windows for x in examples])
     assert [x.shape[:2] for x in found.held_out] == [(3, 9), (3, 9)]
 
 
 @pytest.mark.parametrize(
-    ("num_pois", "num_scans", "observe", "together", "expected"),
+    ("num_pois", "num_scans", "together", "expected"),
     [
         # 171 scans of 3 PoIs are 57 scenes, with an empty one for each 8; the bank needs 10 looks
         # at each of 3 classes, and 25 held-out looks are 9 at each class.
-        (3, 171, "bank", 1, (57, 10, 9, 8)),
-        (3, 168, "bank", 1, (56, 10, 9, 7)),
-        (3, 31, "live", 1, (11, 64, 9, 2)),
-        (4, 31, "bank", 1, (8, 8, 7, 1)),
+        (3, 171, 1, (57, 10, 9, 8)),
+        (3, 168, 1, (56, 10, 9, 7)),
+        (4, 31, 1, (8, 8, 7, 1)),
         # In groups of 4 scenes that show the same PoIs.
-        (3, 31, "live", 4, (12, 256, 12, 2)),
+        (3, 31, 4, (12, 12, 12, 2)),
     ],
 )
-def test_numbers_of_scenes(num_pois, num_scans, observe, together, expected):
+def test_numbers_of_scenes(num_pois, num_scans, together, expected):
     learning = {"learns_from": "scans", "fusion": "filter"} if together > 1 else {}
     config = dataclasses.replace(
         MEASURED,
         arena=dataclasses.replace(MEASURED.arena, num_pois=num_pois),
         detector=dataclasses.replace(MEASURED.detector, num_scans=num_scans),
         jmvae=JmvaeConfig(samples_per_class=10, **learning),
-        dqn=dataclasses.replace(MEASURED.dqn, observe=observe),
     )
     assert num_scenes(config) == expected
