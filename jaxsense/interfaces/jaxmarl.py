@@ -97,14 +97,6 @@ class TeamEnv(multi_agent_env.MultiAgentEnv):
         """Actions that each robot has, `[N + 1]` bool: only NOP if it is not its turn."""
         return self.robots.named(self.robots.action_mask(state.team))
 
-    @property
-    def agent_classes(self) -> dict[str, list[str]]:
-        """Robots of each modality."""
-        mdp, classes = self.robots.played.mdp, dict[str, list[str]]()
-        for agent, sensor in zip(self.agents, mdp.robots, strict=True):
-            classes.setdefault(mdp.modalities[int(sensor)], []).append(agent)
-        return classes
-
 
 @functools.cache  # jaxmarl makes environments static, see `TeamEnv`
 def make(name: str) -> TeamEnv:

@@ -16,6 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 from mujoco import mjx
+from scipy.spatial.transform import Rotation
 
 from jaxsense.config.scene import POI_HEIGHT, TIMESTEP, ArenaConfig
 from jaxsense.core import checks
@@ -78,10 +79,8 @@ class Arena:
     @functools.cached_property
     def geom_axes(self) -> Float[np.ndarray, "G 3 3"]:
         """Rotation matrix of each geom in its body."""
-        axes = np.zeros((self.mj_model.ngeom, 9))
-        for row, quat in zip(axes, self.mj_model.geom_quat, strict=True):
-            mujoco.mju_quat2Mat(row, quat)  # pyright: ignore[reportAttributeAccessIssue]
-        return axes.reshape(-1, 3, 3).astype(np.float32)
+        turns = Rotation.from_quat(self.mj_model.geom_quat, scalar_first=True)
+        return turns.as_matrix().astype(np.float32)
 
 
 @checks.typed

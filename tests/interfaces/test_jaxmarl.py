@@ -22,7 +22,6 @@ def test_agents_and_spaces_are_those_of_the_robots(env):
 
     assert isinstance(env, MultiAgentEnv)
     assert (env.num_agents, env.agents) == (3, AGENTS)
-    assert env.agent_classes == {"camera": ["camera_1", "camera_2"], "lidar": ["lidar"]}
     # Mean, deviation (2 each), time, 3 for each of 2 modalities, presence and place: 14 of 8 PoIs.
     observations, state = env.reset(jax.random.key(0))
     available = env.get_avail_actions(state)
