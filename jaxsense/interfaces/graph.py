@@ -110,21 +110,6 @@ class Graph:
         last = self.op("Min", self.cast(index, np.int64), self.size(size - window))
         return self.op("Max", last, 0)
 
-    def taken(
-        self, x: str, shape: Sequence[Size], terms: Sequence[Sequence[tuple[str, Sequence[int]]]]
-    ) -> str:
-        """An array of a shape of elements of another.
-
-        On each axis of the other, their index is a sum of terms, each along some axes of the shape.
-        """
-        indices = []
-        for of_axis in terms:
-            index = self.op("Expand", 0, self.shape(shape))
-            for term, axes in of_axis:
-                index = self.op("Add", index, self.broadcast(term, shape, axes))
-            indices.append(self.op("Unsqueeze", index, [-1]))
-        return self.op("GatherND", x, self.op("Concat", *indices, axis=-1))
-
     def run(self, closed: core.ClosedJaxpr, inputs: Sequence[str]) -> list[str]:
         """Translates all equations of a function, and returns the names of its outputs."""
         jaxpr = closed.jaxpr

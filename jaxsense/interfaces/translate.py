@@ -7,7 +7,7 @@ needs no line here, unless it uses a primitive that `_OPERATORS` lacks.
 import dataclasses
 import itertools
 from collections import ChainMap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -86,12 +86,12 @@ def _slice(graph: Graph, e: Equation, x: str) -> str:
 
 
 def _dynamic_slice(graph: Graph, e: Equation, x: str, *starts: str) -> str:
-    sizes, shape = e.params["slice_sizes"], e.invars[0].aval.shape
-    terms = [
-        [(graph.start(start, shape[axis], sizes[axis]), []), (graph.range(sizes[axis]), [axis])]
-        for axis, start in enumerate(starts)
-    ]
-    return graph.taken(x, sizes, terms)
+    sizes, axes = e.params["slice_sizes"], [*range(len(starts))]
+    of_axes = zip(starts, e.invars[0].aval.shape, sizes, strict=True)
+    first = graph.op(
+        "Concat", *(graph.op("Reshape", graph.start(*y), [1]) for y in of_axes), axis=0
+    )
+    return graph.op("Slice", x, first, graph.op("Add", first, graph.shape(sizes)), axes)
 
 
 def _reduced(operator: str, dtype: Any = None) -> Callable[..., str]:
@@ -130,19 +130,24 @@ def _gather(graph: Graph, e: Equation, x: str, indices: str) -> str:
     require(e.params["mode"] != GatherScatterMode.FILL_OR_DROP, "gather that fills")
     numbers, sizes = e.params["dimension_numbers"], e.params["slice_sizes"]
     shape, found = e.invars[0].aval.shape, e.outvars[0].aval.shape
-    mapped, batched = [*numbers.start_index_map], [*numbers.operand_batching_dims]
     batch = [axis for axis in range(len(found)) if axis not in numbers.offset_dims]
-    dropped = {*numbers.collapsed_slice_dims, *batched}
-    kept = [axis for axis in range(len(shape)) if axis not in dropped]
-    terms: list[list[tuple[str, Sequence[int]]]] = [[] for _ in shape]
-    for i, axis in enumerate(mapped):
-        start = graph.op("Gather", indices, i, axis=e.invars[1].aval.ndim - 1)
-        terms[axis].append((graph.start(start, shape[axis], sizes[axis]), batch))
-    for axis, at in zip(batched, numbers.start_indices_batching_dims, strict=True):
-        terms[axis].append((graph.range(shape[axis]), [batch[at]]))
-    for axis, at in zip(kept, numbers.offset_dims, strict=True):
-        terms[axis].append((graph.range(sizes[axis]), [at]))
-    return graph.taken(x, found, terms)
+    of_starts = {axis: i for i, axis in enumerate(numbers.start_index_map)}
+    batched = zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True)
+    of_batch = {axis: batch[at] for axis, at in batched}
+    windows, indices_of = iter(numbers.offset_dims), []
+    for axis, (length, size) in enumerate(zip(shape, sizes, strict=True)):
+        # The index on this axis is a sum of terms, each along some axes of the result.
+        index = graph.op("Expand", 0, graph.shape(found))
+        if axis in of_starts:
+            start = graph.op("Gather", indices, of_starts[axis], axis=e.invars[1].aval.ndim - 1)
+            term = graph.broadcast(graph.start(start, length, size), found, batch)
+            index = graph.op("Add", index, term)
+        if axis in of_batch or axis not in numbers.collapsed_slice_dims:
+            along = of_batch[axis] if axis in of_batch else next(windows)
+            rows = graph.range(length if axis in of_batch else size)
+            index = graph.op("Add", index, graph.broadcast(rows, found, [along]))
+        indices_of.append(graph.op("Unsqueeze", index, [-1]))
+    return graph.op("GatherND", x, graph.op("Concat", *indices_of, axis=-1))
 
 
 def _scatter(graph: Graph, e: Equation, x: str, indices: str, updates: str) -> str:
