@@ -1,6 +1,7 @@
 """A team as environments of PettingZoo: `pip install 'jaxsense[pettingzoo]'`.
 
-`make("team-v0")` and `make_parallel("team-v0")` make a task.
+`make("team-v0")` makes a task. PettingZoo's `turn_based_aec_to_parallel` makes it a `ParallelEnv`,
+whose masks allow robots that must wait NOP alone; `active_agent` in the infos names the other.
 """
 
 from collections.abc import Callable
@@ -20,7 +21,6 @@ from jaxsense.tasks import Task, TimeStep
 with common.extra("pettingzoo"):
     from gymnasium import error, spaces  # pyright: ignore[reportMissingImports]
     from pettingzoo import AECEnv  # pyright: ignore[reportMissingImports]
-    from pettingzoo.utils import conversions  # pyright: ignore[reportMissingImports]
 
 T = TypeVar("T")
 
@@ -126,26 +126,9 @@ class TeamAECEnv(AECEnv):
         return {agent: kind(of_each[agent]) for agent in self.agents}
 
 
-class TeamParallelEnv(conversions.turn_based_aec_to_parallel_wrapper):
-    """`TeamAECEnv` as a `ParallelEnv`, for libraries that step all agents together.
-
-    In each step only the action of the robot whose turn it is counts: masks allow the others NOP
-    alone, and `active_agent` in the infos names it.
-    """
-
-    def __init__(self, mdp: Mdp | Task, config: Config | None = None):
-        """Makes the environment, see `TeamAECEnv`."""
-        super().__init__(TeamAECEnv(mdp, config))
-
-
 def make(name: str) -> TeamAECEnv:
     """The `AECEnv` of a task of a team, see `jaxsense.make`."""
     return TeamAECEnv(tasks.make(name))
-
-
-def make_parallel(name: str) -> TeamParallelEnv:
-    """The `ParallelEnv` of a task of a team, see `jaxsense.make`."""
-    return TeamParallelEnv(tasks.make(name))
 
 
 @jax.jit

@@ -1,92 +1,22 @@
-"""Poses from which a sensor faces a PoI, in range and free of collisions.
+"""Room at viewpoints, and looks that do not show their PoI.
 
-And looks that do not show their PoI: empty places, walls, covers, other robots, wrong bearings.
+These show empty places, walls, covers or other robots, or are in a wrong direction.
 """
 
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jaxsense.config.scene import CLEARANCE, MAX_BEARING, ArenaConfig, ViewpointConfig
+from jaxsense.config.scene import ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Index, Key, pytree
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 from jaxsense.sim.sensors import Sensor
 
-_NUM_CANDIDATES = 16
 _ABSENT = {"empty": 2, "wall": 3, "outside": 1, "off": 2, "covered": 2, "robot": 3}  # shares
 _MIN_DISTANCE = 0.12  # m, between the centres of two robots
-
-
-def random_viewpoint(
-    key: Key,
-    config: ViewpointConfig,
-    arena: ArenaConfig,
-    layout: Layout,
-    others: Float[Array, "K 2"],
-    poi: Int[Array, ""],
-) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """Pose from which a robot looks at a PoI, and the bearing of the PoI as it believes it.
-
-    Candidates are uniform in distance and direction. Returns the first one that is free and has an
-    unobstructed view of the PoI, or the one with the most room if there is none.
-
-    Args:
-      others: positions of the other robots, in metres.
-    """
-    chex.assert_shape(others, (None, 2))
-    # A single draw, because each use of the random generator takes long to compile.
-    draws = jax.random.uniform(key, (2 * _NUM_CANDIDATES + 2,))
-    near, far = config.min_distance, config.max_distance
-    distance = near + (far - near) * draws[:_NUM_CANDIDATES]
-    side = jnp.pi * (2 * draws[_NUM_CANDIDATES:-2] - 1)
-    target = layout.position[poi]
-    position = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
-    room = free_room(position[0], position[1], CLEARANCE, arena, layout, others, poi)
-    first_free = jnp.argmax(room > 0)
-    chosen = jnp.where(jnp.any(room > 0), first_free, jnp.argmax(room))
-
-    bearing, believed = _bearings(draws[-2], draws[-1], config)
-    yaw = side[chosen] + jnp.pi - bearing
-    return jnp.stack([position[0][chosen], position[1][chosen], yaw]), believed
-
-
-def moved_viewpoint(
-    key: Key,
-    config: ViewpointConfig,
-    arena: ArenaConfig,
-    layout: Layout,
-    others: Float[Array, "K 2"],
-    poi: Int[Array, ""],
-    position: Float[Array, "2"],
-    distance: Float[Array, ""],
-) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-    """`random_viewpoint` at a distance from a place, in metres.
-
-    The pose is at the place itself if no free one at that distance is in range and shows the PoI.
-    """
-    draws = jax.random.uniform(key, (_NUM_CANDIDATES + 2,))
-    direction, target = jnp.pi * (2 * draws[:-2] - 1), layout.position[poi]
-    x = position[0] + distance * jnp.cos(direction)
-    y = position[1] + distance * jnp.sin(direction)
-    to_poi = jnp.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
-    is_free = free_room(x, y, CLEARANCE, arena, layout, others, poi) > 0
-    is_free &= (to_poi >= config.min_distance) & (to_poi <= config.max_distance)
-    chosen = jnp.argmax(is_free)
-    stand = jnp.where(jnp.any(is_free), jnp.stack([x[chosen], y[chosen]]), position)
-    bearing, believed = _bearings(draws[-2], draws[-1], config)
-    yaw = jnp.arctan2(target[1] - stand[1], target[0] - stand[0]) - bearing
-    return jnp.append(stand, yaw), believed
-
-
-def _bearings(
-    heading: jax.Array, error: jax.Array, config: ViewpointConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Bearing of a PoI, and the one that the robot believes, from uniform draws."""
-    bearing = jnp.radians(MAX_BEARING) * (2 * heading - 1)
-    return bearing, bearing + jnp.radians(config.bearing_error) * (2 * error - 1)
 
 
 def bearing(

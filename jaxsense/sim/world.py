@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -10,7 +11,7 @@ from mujoco import mjx
 
 from jaxsense.config import Config
 from jaxsense.config.mission import LocalisationConfig
-from jaxsense.config.scene import ViewpointConfig
+from jaxsense.config.scene import CLEARANCE, MAX_BEARING, ViewpointConfig
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, pytree
@@ -18,6 +19,8 @@ from jaxsense.sim import arena as arenas
 from jaxsense.sim import localisation, sensors, viewpoints, windows
 from jaxsense.sim.light import Light, random_light
 from jaxsense.sim.viewpoints import View
+
+_NUM_CANDIDATES = 16
 
 
 @pytree
@@ -81,6 +84,71 @@ def make_world(
     return World(arena, sensors.make(config), config.viewpoint, localised)
 
 
+def random_viewpoint(
+    key: Key,
+    world: World,
+    layout: arenas.Layout,
+    others: Float[Array, "K 2"],
+    poi: Int[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """Pose from which a robot looks at a PoI, and the bearing of the PoI as it believes it.
+
+    Candidates are uniform in distance and direction. Returns the first one that is free and has an
+    unobstructed view of the PoI, or the one with the most room if there is none.
+
+    Args:
+      others: positions of the other robots, in metres.
+    """
+    chex.assert_shape(others, (None, 2))
+    # A single draw, because each use of the random generator takes long to compile.
+    draws = jax.random.uniform(key, (2 * _NUM_CANDIDATES + 2,))
+    near, far = world.viewpoint.min_distance, world.viewpoint.max_distance
+    distance = near + (far - near) * draws[:_NUM_CANDIDATES]
+    side = jnp.pi * (2 * draws[_NUM_CANDIDATES:-2] - 1)
+    target = layout.position[poi]
+    x, y = target[0] + distance * jnp.cos(side), target[1] + distance * jnp.sin(side)
+    room = viewpoints.free_room(x, y, CLEARANCE, world.arena.config, layout, others, poi)
+    chosen = jnp.where(jnp.any(room > 0), jnp.argmax(room > 0), jnp.argmax(room))
+    bearing, believed = _bearings(draws[-2], draws[-1], world.viewpoint)
+    return jnp.stack([x[chosen], y[chosen], side[chosen] + jnp.pi - bearing]), believed
+
+
+def moved_viewpoint(
+    key: Key,
+    world: World,
+    layout: arenas.Layout,
+    others: Float[Array, "K 2"],
+    poi: Int[Array, ""],
+    position: Float[Array, "2"],
+    distance: Float[Array, ""],
+) -> tuple[Float[Array, "3"], Float[Array, ""]]:
+    """`random_viewpoint` at a distance from a place, in metres.
+
+    The pose is at the place itself if no free one at that distance is in range and shows the PoI.
+    """
+    draws = jax.random.uniform(key, (_NUM_CANDIDATES + 2,))
+    direction, target = jnp.pi * (2 * draws[:-2] - 1), layout.position[poi]
+    x = position[0] + distance * jnp.cos(direction)
+    y = position[1] + distance * jnp.sin(direction)
+    to_poi = jnp.sqrt((x - target[0]) ** 2 + (y - target[1]) ** 2)
+    near, far = world.viewpoint.min_distance, world.viewpoint.max_distance
+    room = viewpoints.free_room(x, y, CLEARANCE, world.arena.config, layout, others, poi)
+    is_free = (room > 0) & (to_poi >= near) & (to_poi <= far)
+    chosen = jnp.argmax(is_free)
+    stand = jnp.where(jnp.any(is_free), jnp.stack([x[chosen], y[chosen]]), position)
+    bearing, believed = _bearings(draws[-2], draws[-1], world.viewpoint)
+    yaw = jnp.arctan2(target[1] - stand[1], target[0] - stand[0]) - bearing
+    return jnp.append(stand, yaw), believed
+
+
+def _bearings(
+    heading: jax.Array, error: jax.Array, config: ViewpointConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Bearing of a PoI, and the one that the robot believes, from uniform draws."""
+    bearing = jnp.radians(MAX_BEARING) * (2 * heading - 1)
+    return bearing, bearing + jnp.radians(config.bearing_error) * (2 * error - 1)
+
+
 def random_scene(
     key: Key, world: World, classes: Int[Array, "N"], places: Key | None = None
 ) -> Scene:
@@ -97,7 +165,7 @@ def random_scene(
     pois = jax.random.randint(poi_key, (len(robot_keys),), 0, world.arena.config.num_pois)
     poses = jnp.zeros((0, 3))
     for robot_key, poi in zip(robot_keys, pois, strict=True):
-        pose, _ = _viewpoint(robot_key, world, layout, poses, poi)
+        pose, _ = random_viewpoint(robot_key, world, layout, poses[:, :2], poi)
         poses = jnp.concatenate([poses, pose[None]])
     return Scene(layout, random_light(light_key, world.reads_conditions), poses)
 
@@ -124,26 +192,19 @@ def look(
       robot at its viewpoint.
     """
     checks.require_key(key)
-    if not 0 <= robot < len(world.sensors):
-        raise ValueError(f"robot = {robot}: must be one of the {len(world.sensors)} robots")
+    checks.require_index("robot", robot, len(world.sensors))
     checks.require_index("poi", poi, world.arena.config.num_pois)
-    others, layout = jnp.delete(scene.poses, robot, axis=0), scene.layout
+    given = world, scene.layout, jnp.delete(scene.poses, robot, axis=0)[:, :2], poi
     if farthest is None:
         viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
-        pose, bearing = _viewpoint(viewpoint_key, world, layout, others, poi)
+        pose, bearing = random_viewpoint(viewpoint_key, *given)
     else:
         distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
-        pose, bearing = viewpoints.moved_viewpoint(
-            viewpoint_key,
-            world.viewpoint,
-            world.arena.config,
-            layout,
-            others[:, :2],
-            poi,
-            scene.poses[robot, :2],
-            farthest * jax.random.uniform(distance_key) ** 3,
-        )
-    bearing, distance = _believed(error_key, world, pose, bearing, layout.position[poi])
+        distance = farthest * jax.random.uniform(distance_key) ** 3
+        place = scene.poses[robot, :2]
+        pose, bearing = moved_viewpoint(viewpoint_key, *given, place, distance)
+    position = scene.layout.position[poi]
+    bearing, distance = _believed(error_key, world, pose, bearing, position)
     scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
     return (window_around(noise_key, world, scene, robot, bearing), distance), scene
 
@@ -218,7 +279,8 @@ def survey(
 
     def view_of(key: Key, robot: jax.Array, poi: jax.Array) -> View:
         pose_key, error_key, absent_key = jax.random.split(key, 3)
-        pose, bearing = _viewpoint(pose_key, world, scene.layout, others(scene.poses, robot), poi)
+        around = others(scene.poses[:, :2], robot)
+        pose, bearing = random_viewpoint(pose_key, world, scene.layout, around, poi)
         bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
         poses = scene.poses.at[robot].set(pose)
         view = View(scene.layout.position, poses, away, bearing, distance)
@@ -259,9 +321,3 @@ def _believed(
     believed = pose + localisation.draw(key, world.localisation, 1)[0]
     turned = viewpoints.bearing(believed, position) - viewpoints.bearing(pose, position)
     return bearing + turned, jnp.linalg.norm(position - believed[:2])
-
-
-def _viewpoint(key: Key, world: World, layout: arenas.Layout, others: jax.Array, poi: jax.Array):
-    return viewpoints.random_viewpoint(
-        key, world.viewpoint, world.arena.config, layout, others[:, :2], poi
-    )

@@ -334,8 +334,14 @@ FUNCTIONS = [
     (lambda w: sim.cut_out(w.lidar, np.ones(683), 90.0), "bearing = 90.0"),
     (lambda w: sim.cut_out(w.lidar, -np.ones(683), 0.0), "readings of lidar = -1.0"),
     (lambda w: dataclasses.replace(w.lidar, height=0.0), "height = 0.0"),
-    (lambda w: sim.look(w.key, w.world, w.scene, -1, 0), "robot = -1: must be one of the 2 robots"),
-    (lambda w: sim.look(w.key, w.world, w.scene, 2, 0), "robot = 2: must be one of the 2 robots"),
+    (
+        lambda w: sim.look(w.key, w.world, w.scene, -1, 0),
+        "robot = -1: must be a whole number from 0 to 1",
+    ),
+    (
+        lambda w: sim.look(w.key, w.world, w.scene, 2, 0),
+        "robot = 2: must be a whole number from 0 to 1",
+    ),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, -2), "robot = -2: must be -1 or one of"),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, 2), "robot = 2: must be -1 or one of"),
     (lambda w: survey(0, w.world, w.classes), "key = 0: must be one key"),

@@ -9,21 +9,20 @@ import small
 pytest.importorskip("pettingzoo", reason="needs the extra jaxsense[pettingzoo]")
 
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.utils import turn_based_aec_to_parallel as parallel
 
-from jaxsense.interfaces.pettingzoo import TeamAECEnv, TeamParallelEnv, make, make_parallel
+from jaxsense.interfaces.pettingzoo import TeamAECEnv, make
 
 AGENTS, NOP = [*small.AGENTS], small.TEAM_NOP
-OWN = (
-    lambda: TeamAECEnv(small.team(), small.TEAM),
-    lambda: TeamParallelEnv(small.team(), small.TEAM),
-)
-TASK = lambda: make("team-v0"), lambda: make_parallel("team-v0")
+
+
+def own():
+    return TeamAECEnv(small.team(), small.TEAM)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("both", [TASK, pytest.param(OWN, marks=pytest.mark.slow)])
-def test_pettingzoos_own_tests_pass(both):
-    turns, together = both
+@pytest.mark.parametrize("turns", [own, lambda: make("team-v0")])
+def test_pettingzoos_own_tests_pass(turns):
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         # A mean of one's own MDP has no bounds, and the only LiDAR no number.
@@ -31,12 +30,12 @@ def test_pettingzoos_own_tests_pass(both):
             warnings.filterwarnings("ignore", known)
         api_test(turns(), num_cycles=40)
         seed_test(turns, num_cycles=40)
-        parallel_api_test(together(), num_cycles=40)
-        parallel_seed_test(together, num_cycles=40)
+        parallel_api_test(parallel(turns()), num_cycles=40)
+        parallel_seed_test(lambda: parallel(turns()), num_cycles=40)
 
 
 def test_robots_take_turns_and_leave():
-    env = OWN[0]()
+    env = own()
     env.reset(seed=0)
     totals, earned, left = dict.fromkeys(AGENTS, 0.0), dict.fromkeys(AGENTS, 0.0), {}
     rng = np.random.default_rng(0)
@@ -62,11 +61,11 @@ def test_robots_take_turns_and_leave():
 
 
 def test_seeds_repeat_and_differ():
-    together = OWN[1]()
+    together = parallel(own())
     first, again, other, later = (together.reset(s)[0]["lidar"] for s in (1, 1, 2, None))
     np.testing.assert_array_equal(first, again)
     # Without any seed, two environments differ; what they give is the caller's to change.
-    fresh = OWN[1]().reset()[0]["lidar"]
+    fresh = parallel(own()).reset()[0]["lidar"]
     for one, two in ((first, other), (other, later), (fresh, later)):
         assert (one != two).any()
     fresh += 1.0

@@ -9,9 +9,12 @@ from jaxsense import sim
 from jaxsense.config import Config
 from jaxsense.config.scene import CLEARANCE, ArenaConfig, ViewpointConfig
 from jaxsense.sim import viewpoints
+from jaxsense.sim import world as worlds
 
 CLASSES = jnp.array([0, 1, 2])  # green cylinder, red cylinder, red cube
 NUM_LOOKS = 16
+# Viewpoints need no more of a world.
+WORLD = SimpleNamespace(viewpoint=ViewpointConfig(), arena=SimpleNamespace(config=ArenaConfig()))
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +26,7 @@ def draws():
         layout = sim.random_layout(layout_key, ArenaConfig(), CLASSES)
         other = jax.random.uniform(other_key, (1, 2), minval=-1.3, maxval=1.3)
         poi = jax.random.randint(poi_key, (), 0, 3)
-        pose, bearing = viewpoints.random_viewpoint(
-            key, ViewpointConfig(), ArenaConfig(), layout, other, poi
-        )
+        pose, bearing = worlds.random_viewpoint(key, WORLD, layout, other, poi)
         return layout.position, other[0], poi, pose, bearing
 
     drawn = jax.device_get(jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), 3000)))
@@ -84,8 +85,7 @@ def test_the_first_free_viewpoint_is_taken_or_that_with_the_most_room(monkeypatc
 
     monkeypatch.setattr(viewpoints, "free_room", free_room)
     layout, nobody = SimpleNamespace(position=jnp.zeros((3, 2))), jnp.zeros((0, 2))
-    given = ViewpointConfig(), ArenaConfig(), layout, nobody, 0
-    pose, _ = viewpoints.random_viewpoint(jax.random.key(0), *given)
+    pose, _ = worlds.random_viewpoint(jax.random.key(0), WORLD, layout, nobody, 0)
     first, most = np.argmax(rooms[0] > 0), np.argmax(rooms[0])
     assert 0 != first != most if is_first else first == 0 != most
     assert pose[0] == pytest.approx(float(rooms[0][first if is_first else most] + above), rel=1e-5)
@@ -137,8 +137,8 @@ def moved():
     @jax.jit
     def draw(keys, distance, others):
         return jax.vmap(
-            lambda key: viewpoints.moved_viewpoint(
-                key, ViewpointConfig(), ArenaConfig(), layout, others, jnp.int32(0), PLACE, distance
+            lambda key: worlds.moved_viewpoint(
+                key, WORLD, layout, others, jnp.int32(0), PLACE, distance
             )
         )(keys)
 
