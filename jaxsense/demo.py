@@ -9,12 +9,11 @@ import jax
 import rich.console
 
 from jaxsense import mission
-from jaxsense.config import ConfigError
 from jaxsense.config.options import command
 from jaxsense.config.section import Checked, limited
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
-from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import film, page, tables
@@ -59,7 +58,7 @@ def main(argv: list[str] | None = None) -> None:
     """
     arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
-    try:
+    with cli.ending(PROGRAM):
         devices.start(1)
         config, models = load_pretrained(arguments.preset)
         scenario, cases = mission.make_mission(config), mission.cases(config)
@@ -80,35 +79,20 @@ def main(argv: list[str] | None = None) -> None:
             text = page.fill(
                 "demo.html.jinja",
                 preset=arguments.preset,
+                policy=arguments.policy,
                 seed=arguments.seed,
                 other=next(name for name in PRETRAINED if name != arguments.preset),
                 films=[dict(zip(recordings, map(page.drawing, films), strict=True))],
                 averages=_AVERAGES,
                 table=table,
-                sentence=_sentence(arguments.policy),
             )
             files.write(path, text)
-    except (ConfigError, StageError) as error:
-        cli.fail(PROGRAM, str(error))
-    except OSError as error:
-        cli.fail(PROGRAM, f"{cli.reason(error)}")
     say(as_text(console, table))
     say(f"This is one mission of many; averages: README, {_AVERAGES}.")
     say(f"The page is {path}.")
     say(f"Next: {command('jaxsense tasks')}")
     if arguments.browser and _has_display():
         webbrowser.open_new_tab(path.resolve().as_uri())
-
-
-def _sentence(policy: str) -> str:
-    """What the animations show."""
-    naive = "under naive exploration, every PoI (point of interest) gets one look with each sensor"
-    if policy == _REFERENCE:
-        return f"{naive[0].upper()}{naive[1:]}, and what it sees goes into the shared map."
-    how = f"the policy {policy} chooses each look"
-    if policy == "latent":
-        how = "robots take looks that the learned policy (latent) calls useful on the shared map"
-    return f"In the first animation, {how}, until no look pays; {naive}."
 
 
 def _has_display() -> bool:

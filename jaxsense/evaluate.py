@@ -17,7 +17,7 @@ from jaxsense.config.section import Checked, limited
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
-from jaxsense.run.monitor import Monitor, StageError
+from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.run.settings import MAX_SEED
@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     arguments = cli.parse(PROGRAM, Arguments, argv)
     console = rich.console.Console()
     display = Display(console)
-    try:
+    with cli.ending(PROGRAM):
         arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
         trained, models = rundir.load(arguments.run, arguments.trust)
@@ -107,17 +107,13 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         block, written = make.missions(config, found.metrics), []
         if arguments.animate:
             (name, recording), *_ = found.recordings.items()
-            title, stem = _film(arguments, trained, config, name)
+            title = f"{name} policy, seed {arguments.seed}"
             (text,) = film.draw(config, {title: recording}, models.fusion)
-            path = arguments.run / f"{stem}.svg"
+            elsewhere = "" if config == trained else f"-{_place(config)}"
+            path = arguments.run / f"mission-{name}-{arguments.seed}{elsewhere}.svg"
             files.write(path, text)
             written.append(f"The first mission of {name} is in {path}.")
         written.append(_write(arguments, trained, config, block))
-    except (ConfigError, StageError) as error:
-        cli.fail(PROGRAM, str(error))
-    except OSError as error:
-        done = "written" if isinstance(error, files.WriteError) else "used"
-        cli.fail(PROGRAM, f"run = {str(arguments.run)!r}: cannot be {done} ({cli.reason(error)})")
     _print(console, block, arguments.episodes)
     timing = monitor.timing()
     seconds = timing["stages"]["mission"]["run_s"]
@@ -129,15 +125,6 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
     )
     for line in written:
         say(line)
-
-
-def _film(arguments: Arguments, trained: Config, config: Config, name: str) -> tuple[str, str]:
-    """Title of the film of a case, and the name of its file."""
-    stem = f"mission-{name}-{arguments.seed}"
-    if config == trained:
-        return f"{name} policy, seed {arguments.seed}", stem
-    title = f"{name}, {config.arena.num_pois} PoIs, {len(config.carried)} robots"
-    return title, f"{stem}-{_place(config)}"
 
 
 def _write(arguments: Arguments, trained: Config, config: Config, missions: blocks.Missions) -> str:

@@ -4,7 +4,6 @@ import numpy as np
 import rich.console
 
 from jaxsense import tasks
-from jaxsense.config import ConfigError
 from jaxsense.config.section import Checked
 from jaxsense.run import cli, devices, output
 from jaxsense.run.output import tell
@@ -31,10 +30,8 @@ def main(argv: list[str] | None = None) -> None:
       argv: the command line without the program; by default the process's own.
     """
     cli.parse(PROGRAM, Arguments, argv)
-    try:
+    with cli.ending(PROGRAM):
         devices.start(1)
-    except ConfigError as error:
-        cli.fail(PROGRAM, str(error))
     found = [tasks.make(name, agent) for name in tasks.registered() for agent in agents(name)]
     tell(as_text(rich.console.Console(), _table(found)))
     for name, about in TASKS.items():

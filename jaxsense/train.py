@@ -23,7 +23,7 @@ from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import command, given
 from jaxsense.config.section import Checked, limited
 from jaxsense.mission.outcome import require_playable
-from jaxsense.run import cli, devices, files, output, pipeline, rundir
+from jaxsense.run import cli, devices, output, pipeline, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
@@ -102,7 +102,7 @@ def main(
     if is_helper := bool(arguments.process_index):
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     console = rich.console.Console(quiet=arguments.quiet)
-    try:
+    with cli.ending(PROGRAM, "; earlier checkpoints are intact"):
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
             run.check_seeds()
@@ -114,12 +114,6 @@ def main(
             )
             _train(arguments, run, monitor, console, policies)
         devices.leave()
-    except ConfigError as error:
-        cli.fail(PROGRAM, str(error))
-    except OSError as error:
-        # Usually a full disk. Every file is written as a whole or not at all.
-        cannot = "cannot write " if isinstance(error, files.WriteError) else ""
-        cli.fail(PROGRAM, f"{cannot}{cli.reason(error)}; earlier checkpoints are intact")
     if is_helper:
         return
     if not arguments.quiet:
@@ -143,7 +137,7 @@ def parse(
       change: changes a preset before the other options do.
       policies: custom policies by name.
     """
-    try:
+    with cli.ending(PROGRAM):
         stored = _stored(argv, change)
         arguments = cli.parse(PROGRAM, Arguments(stored), argv, _COMMON)
         require_playable(arguments.settings.config, policies)
@@ -159,8 +153,6 @@ def parse(
                 raise ConfigError("resume", resume, reason)
             if arguments.settings != stored:
                 raise ConfigError("resume", resume, "resumes in its own settings; omit others")
-    except ConfigError as error:
-        cli.fail(PROGRAM, str(error))
     return arguments
 
 

@@ -7,8 +7,8 @@ shapes a program is structure. Settings from Python, JSON and command lines pass
 import contextlib
 import dataclasses
 import functools
-import importlib
 import inspect
+import pkgutil
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -373,9 +373,8 @@ def named_function(field: str, path: str) -> Callable[..., object]:
     Raises:
       ConfigError: if it cannot be imported.
     """
-    module, _, function = path.partition(":")
     try:
-        return getattr(importlib.import_module(module), function)
+        return pkgutil.resolve_name(path)
     except (ImportError, AttributeError) as error:
         reason = f"must be a function that can be imported ({error})"
         raise ConfigError(field, path, reason) from None

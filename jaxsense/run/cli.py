@@ -1,8 +1,9 @@
 """Reads command lines; user errors end a program in one line."""
 
+import contextlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -11,6 +12,8 @@ import jax
 from jaxsense.config import Config, ConfigError, options
 from jaxsense.config.section import require_32_bits
 from jaxsense.run.compilation import Kept, use_cache
+from jaxsense.run.files import WriteError
+from jaxsense.run.monitor import StageError
 from jaxsense.run.output import complain, tell
 
 T = TypeVar("T")
@@ -33,11 +36,9 @@ def parse(program: str, base: T | type[T], argv: list[str] | None, common: Seque
     if {"-h", "--help", "--help-all"} & set(argv):
         tell(options.describe(program, base, () if "--help-all" in argv else common).rstrip())
         sys.exit(0)
-    try:
+    with ending(program):
         require_32_bits()
         return options.read(base, argv)
-    except ConfigError as error:
-        fail(program, str(error))
 
 
 def warn(program: str, message: str) -> None:
@@ -51,9 +52,18 @@ def fail(program: str, message: str) -> NoReturn:
     sys.exit(2)
 
 
-def reason(error: OSError) -> str:
-    """An `OSError` as one line."""
-    return f"{error.filename}: {error.strerror}" if error.filename else str(error)
+@contextlib.contextmanager
+def ending(program: str, advice: str = "") -> Iterator[None]:
+    """Ends a program at an error that its user can correct; `advice` follows those about files."""
+    try:
+        yield
+    except (ConfigError, StageError) as error:
+        fail(program, str(error))
+    except OSError as error:
+        # Usually a full disk. Every file is written as a whole or not at all.
+        cannot = "cannot write " if isinstance(error, WriteError) else ""
+        reason = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        fail(program, f"{cannot}{reason}{advice}")
 
 
 def keep_programs(

@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
-from jaxsense.config.section import require_function
+from jaxsense.config.section import Checked, limited, require, require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import POLICIES, Known, Trained, Values
@@ -19,13 +18,29 @@ from jaxsense.run import devices, missions
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Listener, Monitor
+from jaxsense.run.settings import MAX_SEED
 from jaxsense.summary import make
 from jaxsense.summary.blocks import MISSIONS, Case
-from jaxsense.summary.compare import REFERENCE, differences
+from jaxsense.summary.compare import REFERENCE
 
 _IS_POLICY = "must be a function (key, models, known) -> values that JAX can trace"
 AGAINST = (REFERENCE, "auction", "naive", "random")
 """Policies that `score_missions` compares with, unless told otherwise."""
+
+
+class _Asked(Checked):
+    """What is asked of `score_missions`, apart from the models and the policies themselves."""
+
+    policies: Mapping[str, object]
+    against: tuple[str, ...] = limited((), min_items=1)
+    episodes: int = limited(1, at_least=1, at_most=MAX_EPISODES)
+    seed: int = limited(0, at_least=0, at_most=MAX_SEED)
+
+    def check(self) -> None:
+        """Checks that there are policies of these names to compare with."""
+        names = dict.fromkeys((*POLICIES, *self.policies))
+        expected = f"must be among {', '.join(names)}"
+        require(set(self.against) <= set(names), self, "against", expected)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +116,11 @@ def score_missions(
       ValueError: if another argument is wrong, for example models of another run.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
     """
-    _require(config, models, policies, against, episodes, seed)
+    _Asked(policies, against, episodes, seed)  # pyright: ignore[reportArgumentType]
+    if not models.agent.plays(number := config.arena.num_pois):
+        expected = "must be the number of PoIs that the models were trained with"
+        raise ConfigError("arena.num_pois", number, expected)
+    require_fitting(config, models)
     own = {
         name: each if name in POLICIES else _checked(name, each) for name, each in policies.items()
     }
@@ -116,38 +135,8 @@ def score_missions(
         workers = Workers(threads=devices.threads()) if is_cpu else ALONE
         player = missions.Player(scenario, compiler, total, workers, models)
         found = player.play(jax.random.key(seed), models, played, episodes)
-    reference, blocks = against[0], dict[str, Case]()
-    for name, each in found.metrics.items():
-        blocks[name] = make.case(config, name, each)
-        if name != reference:
-            blocks[name]["intervals"] = differences(each, found.metrics[reference])
-    return MissionScore(blocks, reference, episodes)
-
-
-def _require(
-    config: Config,
-    models: Models,
-    policies: Mapping[str, Values],
-    against: Sequence[str],
-    episodes: int,
-    seed: int,
-) -> None:
-    """Checks the arguments of `score_missions`, before anything is compiled."""
-    checks.require_number("episodes", episodes)
-    if episodes > MAX_EPISODES:
-        raise ConfigError("episodes", episodes, f"must be from 1 to {MAX_EPISODES:,}")
-    if not (isinstance(seed, int | np.integer) and 0 <= seed < 2**32) or isinstance(seed, bool):
-        raise ConfigError("seed", seed, "must be a whole number from 0 to 2^32 - 1")
-    if not (isinstance(policies, Mapping) and all(isinstance(name, str) for name in policies)):
-        raise ConfigError("policies", policies, "must be a dictionary from names to policies")
-    names = dict.fromkeys((*POLICIES, *policies))
-    if not (isinstance(against, list | tuple) and against and all(n in names for n in against)):
-        expected = f"must be a list of one or more of {', '.join(names)}"
-        raise ConfigError("against", against, expected)
-    if not models.agent.plays(number := config.arena.num_pois):
-        expected = "must be the number of PoIs that the models were trained with"
-        raise ConfigError("arena.num_pois", number, expected)
-    require_fitting(config, models)
+    blocks = make.missions(config, found.metrics, against[0])
+    return MissionScore(blocks, against[0], episodes)
 
 
 def _checked(name: str, policy: Values) -> Values:

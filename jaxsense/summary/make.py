@@ -100,12 +100,14 @@ def _returns(rewards: _Rewards, num_starts: int, has_optimum: bool) -> blocks.Re
     }
 
 
-def missions(config: Config, played: Mapping[str, Measured]) -> Missions:
+def missions(
+    config: Config, played: Mapping[str, Measured], reference: str = REFERENCE
+) -> Missions:
     """The block `mission`, from metrics of the missions of each case, in the same arenas."""
     found: Missions = {name: case(config, name, each) for name, each in played.items()}
     for name, block in found.items():
-        if REFERENCE in played and name != REFERENCE:
-            block["intervals"] = differences(played[name], played[REFERENCE])
+        if reference in played and name != reference:
+            block["intervals"] = differences(played[name], played[reference])
     return found
 
 
@@ -144,14 +146,9 @@ def case(config: Config, name: str, found: Measured) -> Case:
 
 def _calibration(found: Measured) -> blocks.Calibration:
     """Whether the confidence of maps matches their accuracy, at PoIs that were detected."""
-    is_seen = np.asarray(found["seen"])
-
-    def of_seen(name: str) -> float | None:
-        values = np.asarray(found[name], float)[is_seen]
-        return float(values.mean()) if values.size else None
-
-    names = {"confidence": "confidence", "accuracy": "is_right", "nll": "nll"}
-    return blocks.Calibration(**{key: of_seen(name) for key, name in names.items()})
+    names, is_seen = ("confidence", "is_right", "nll"), found["seen"]
+    each = (_share(found[name][is_seen].sum(dtype=float), is_seen.sum()) for name in names)
+    return dict(zip(("confidence", "accuracy", "nll"), each, strict=True))
 
 
 def _share(part: int, whole: int) -> float | None:

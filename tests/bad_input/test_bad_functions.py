@@ -187,10 +187,10 @@ FUNCTIONS = [
     (lambda w: of_missions(w, policies={"mine": nop}), "policies['mine'] = nop"),
     (lambda w: of_missions(w, policies={"a_blind": values}), "policies = 'a_blind'"),
     (lambda w: of_missions(w, changed("arena", num_pois=2)), "arena.num_pois = 2: must be the num"),
-    (lambda w: of_missions(w, against=[]), "against = []: must be a list of one or more of"),
-    (lambda w: of_missions(w, against=["x"]), "against = ['x']"),
+    (lambda w: of_missions(w, against=[]), "against = []: must be a list of 1 or more"),
+    (lambda w: of_missions(w, against=["x"]), "against = ('x',): must be among latent"),
     (lambda w: of_missions(w, episodes=0), "episodes = 0"),
-    (lambda w: of_missions(w, episodes=100_001), "episodes = 100001: must be from 1 to 100,000"),
+    (lambda w: of_missions(w, episodes=100_001), "episodes = 100001: must be a whole numb"),
     *(
         (lambda w, seed=seed: of_missions(w, seed=seed), f"seed = {seed}: must be a whole number")
         for seed in (-1, 2**32, True, 0.5)
