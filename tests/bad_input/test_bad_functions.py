@@ -33,6 +33,10 @@ from jaxsense.vae import detectors, fusion, readout
 # Settings whose models have other shapes.
 OTHERS = dataclasses.replace(SMOKE, jmvae=dataclasses.replace(SMOKE.jmvae, latent_size=3))
 WINDOWS = dataclasses.replace(SMOKE, camera=dataclasses.replace(SMOKE.camera, stride=2, window=40))
+FEWER = dataclasses.replace(SMOKE, arena=dataclasses.replace(SMOKE.arena, num_pois=2))
+FARTHER = dataclasses.replace(
+    SMOKE, viewpoint=dataclasses.replace(SMOKE.viewpoint, max_distance=1.3)
+)
 
 
 class World:
@@ -65,8 +69,12 @@ class World:
     def look_of(self, size):
         return self.models.detectors[0], jnp.ones(size), jnp.float32(1)
 
-    def belief_of(self, **parts):
-        return dataclasses.replace(self.belief, **parts)
+    def belief_of(self, **numbers):
+        filled = {name: jnp.full(2, float(x)) for name, x in numbers.items()}
+        return dataclasses.replace(self.belief, **filled)
+
+    def fused(self, fusion):
+        return dataclasses.replace(self.models, fusion=fusion)
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +105,24 @@ def retrain(w, number=0.0, size=None, labels=(0,) * 8, detector=None, **settings
     return vae.retrain(w.key, detector, looks, np.array(labels), config)
 
 
-def train(w, *shapes, number=0.5, params=None):
-    """A JMVAE that is trained for a step on banks of a number."""
-    bank = tuple(jnp.full(shape, number) for shape in shapes)
+def train(w, *shapes, number=0.5, scale=1.0):
+    """A JMVAE, its parameters scaled, that is trained for a step on banks of a number."""
+    bank, params = (
+        tuple(jnp.full(x, number) for x in shapes),
+        jax.tree.map(lambda x: x * scale, w.params),
+    )
     config = dataclasses.replace(SMOKE.jmvae, steps=1, batch=2)
-    return vae.train(w.key, w.params if params is None else params, w.model, bank, config)
+    return vae.train(w.key, params, w.model, bank, config)
+
+
+def mdp_of(w, features):
+    """An MDP whose looks by each sensor are the same."""
+    return make_mdp(SMOKE, w.models, Bank((features, features)))
+
+
+def remembering(act):
+    """The score of a policy with a memory."""
+    return jaxsense.score("map-v0", tasks.Recurrent(act, 0))
 
 
 def log_likelihood(w, weights=(1.0, 1.0), samples=2):
@@ -142,13 +163,7 @@ def seen_by(number):
 
 IS_POLICY = "must be a function (key, observation) -> action, a Recurrent, or a list of them"
 IS_TASK = "must be from make, or one of map-v0, many-v0, noisy-v0, team-v0"
-BAD = jnp.array([0, 1, 7])
-
-
-def changed(section, **values):
-    """Settings of the smoke preset but for some of a section."""
-    of_section = dataclasses.replace(getattr(SMOKE, section), **values)
-    return dataclasses.replace(SMOKE, **{section: of_section})
+BAD, THIRDS = jnp.array([0, 1, 7]), jnp.full(3, 1 / 3)
 
 
 # Calls, and a part of what they say.
@@ -157,36 +172,24 @@ FUNCTIONS = [
     (lambda w: jaxsense.score("map-v0", "greedy"), f"policy = 'greedy': {IS_POLICY}"),
     (lambda w: jaxsense.score(nop, "map-v0"), f"task = nop: {IS_TASK}"),
     (lambda w: jaxsense.score("map-v0", lambda key, x: 0.5), "not float32[]"),
-    (lambda w: jaxsense.score("map-v0", tasks.Recurrent(nop, 0)), "policy.act = nop"),
+    (lambda w: remembering(nop), "policy.act = nop"),
     (lambda w: jaxsense.score("map-v0", lambda key, x: None), "not NoneType"),
-    (
-        lambda w: jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, x: 0, 0)),
-        "an action and a memory",
-    ),
-    (
-        lambda w: jaxsense.score("map-v0", tasks.Recurrent(lambda key, m, x: (0, (m, m)), 0)),
-        "policy: must return a memory with the structure, shapes and dtypes of the first",
-    ),
+    (lambda w: remembering(lambda key, m, x: 0), "an action and a memory"),
+    (lambda w: remembering(lambda key, m, x: (0, (m, m))), "policy: must return a memory with the"),
     (lambda w: jaxsense.make("map-v0").step(w.key, w.state, True), "dtype bool"),
     (lambda w: jaxsense.make("map-v0").step(w.key, w.x, 0), "must be State, as from reset"),
     (lambda w: w.mdp.of(7), "modality = 7: must be a whole number from 0 to 1"),
-    (
-        lambda w: w.models.bayes.update(w.models.bayes.prior, np.ones(1, np.float32), 0),
-        "labels = 1",
-    ),
+    (lambda w: w.models.bayes.update(w.models.bayes.prior, np.ones(1), 0), "labels = 1"),
     (lambda w: interfaces_common.robots_of("team-v0"), "mdp = 'team-v0'"),
     (lambda w: vae.Jmvae(("a",), (2,), None, (8,)), "latent_size = None"),
     (lambda w: of_missions(w, policies=values), "policies = values"),
     (lambda w: of_missions(w, config=w.models, models=SMOKE), "config = Models"),
-    (
-        lambda w: of_missions(w, models=dataclasses.replace(w.models, fusion=3)),
-        "models.fusion = int: must be a Fusion; it lacks accumulates, classes, prior, update",
-    ),
+    (lambda w: of_missions(w, models=w.fused(3)), "models.fusion = int: must be a Fusion; it lac"),
     (lambda w: of_missions(w, policies={3: values}), "policies = {3: <function values"),
     (lambda w: of_missions(w, policies={"mine": 3}), "policies['mine'] = 3: must be a function"),
     (lambda w: of_missions(w, policies={"mine": nop}), "policies['mine'] = nop"),
     (lambda w: of_missions(w, policies={"a_blind": values}), "policies = 'a_blind'"),
-    (lambda w: of_missions(w, changed("arena", num_pois=2)), "arena.num_pois = 2: must be the num"),
+    (lambda w: of_missions(w, FEWER), "arena.num_pois = 2: must be the num"),
     (lambda w: of_missions(w, against=[]), "against = []: must be a list of 1 or more"),
     (lambda w: of_missions(w, against=["x"]), "against = ('x',): must be among latent"),
     (lambda w: of_missions(w, episodes=0), "episodes = 0"),
@@ -204,53 +207,32 @@ FUNCTIONS = [
     (lambda w: tasks.mean_return(w.key, "map-v0", nop, 0), "episodes = 0"),
     (lambda w: jaxsense.make("team-v0").step(w.key, w.state, 0), "state.seen has the shape (3, 2)"),
     (lambda w: make_mdp(SMOKE, w.models, Bank(w.bank[:1])), "looks has 1 entries: must be 2"),
-    (lambda w: make_mdp(SMOKE, w.models, Bank((w.bank[0] * NAN,) * 2)), "looks = nan"),
-    (
-        lambda w: make_mdp(changed("viewpoint", max_distance=1.3), w.models),
-        "distance of looks by the camera = 1.2999999523162842: must be from 0.3 to 1.2, as",
-    ),
+    (lambda w: mdp_of(w, w.bank[0] * NAN), "looks = nan"),
+    (lambda w: make_mdp(FARTHER, w.models), "= 1.2999999523162842: must be from 0.3 to 1.2, as"),
     (lambda w: sim.make_layout(SMOKE.arena, jnp.zeros((3, 2)), jnp.zeros(3), BAD), "classes = 7"),
     (lambda w: sim.look(w.key, w.world, w.scene, 0, jnp.int32(3)), "poi = 3"),
     (lambda w: replay.sample(jnp.zeros((1, 2)), replay.init(1, 2, 1, 2)), "rounds in replay = 0"),
     (lambda w: value_iteration(w, start=jnp.array([0.75, 0.5])), "sum of start = 1.25: must be 1"),
-    (
-        lambda w: w.models.detect(1, w.lidar, np.ones(720), 0.0, 1.0),
-        "readings of lidar has the shape (720,)",
-    ),
-    (
-        lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), np.ones(20)),
-        "ranges has the shape (20,)",
-    ),
+    (lambda w: w.models.detect(1, w.lidar, np.ones(720), 0.0, 1.0), "lidar has the shape (720,)"),
+    (lambda w: recorded.fit_noise(SMOKE.lidar, np.zeros(20), np.ones(20)), "ranges has the shape"),
     (lambda w: retrain(w, NAN), "windows = nan: must be finite; leave out what was not recorded"),
     (lambda w: retrain(w, labels=[1, 2] * 4), "labels = 2: must be a whole number from 0 to 1"),
-    (
-        lambda w: sim.cut_out(w.camera, np.full((640, 3), 255, np.uint8), 0.0),
-        "readings of dtype uint8",
-    ),
+    (lambda w: sim.cut_out(w.camera, np.ones((640, 3), np.uint8), 0.0), "readings of dtype uint8"),
     (lambda w: dataclasses.replace(w.lidar, stride=0), "stride = 0"),
     (lambda w: vae.Jmvae(("a", "a"), (2, 2), 2, (8,)), "none twice"),
     (lambda w: vae.Jmvae(("a", "b", "a+b"), (2, 2, 2), 2, (8,)), "modalities = ('a', 'b', 'a+b')"),
-    (
-        lambda w: vae.posterior(w.params, w.model, (w.x[None], w.x[None])),
-        "features of camera has the shape (1, 2)",
-    ),
+    (lambda w: vae.posterior(w.params, w.model, (w.x[None],) * 2), "camera has the shape (1, 2)"),
     (lambda w: w.filter.update(w.belief, w.seen, w.look, 0, NAN), "weight = nan"),
-    (
-        lambda w: w.in_place.update(w.belief_of(std=-w.belief.std), w.seen, w.look, 0),
-        "belief.std = -1.0",
-    ),
-    (
-        lambda w: w.in_place.update(w.belief, w.seen, w.x, 1),
-        "sum of features of lidar = 0.0",
-    ),
+    (lambda w: w.in_place.update(w.belief_of(std=-1), w.seen, w.look, 0), "belief.std = -1.0"),
+    (lambda w: w.in_place.update(w.belief, w.seen, w.x, 1), "sum of features of lidar = 0.0"),
     (lambda w: vae.posterior(w.params, w.model, (None, w.x * NAN)), "features of lidar = nan"),
     (lambda w: w.in_place.update(w.belief, w.seen, w.x, 2), "modality = 2"),
     (lambda w: w.models.bayes.update(jnp.full(3, -INF), w.look, 0), "largest of log_posterior"),
-    (lambda w: interpolate(jnp.zeros(7), jnp.full(3, 1 / 3)), "length of table = 7"),
+    (lambda w: interpolate(jnp.zeros(7), THIRDS), "length of table = 7"),
     (lambda w: interpolate(jnp.zeros(6), w.means), "probabilities has the shape (3, 2)"),
     (lambda w: value_iteration(w, likelihoods=jnp.full((2, 3, 2), NAN)), "likelihoods = nan"),
     (lambda w: value_iteration(w, horizon=0), "horizon = 0"),
-    (lambda w: value_iteration(w, start=jnp.full(3, 1 / 3)), "start has the shape (3,)"),
+    (lambda w: value_iteration(w, start=THIRDS), "start has the shape (3,)"),
     (lambda w: replay.init(0, 2, 1, 2), "state_size = 0"),
     (lambda w: replay.add(replay.init(3, 5, 2, 4), seen_by(7)), "transitions.s_tm1 has the shape"),
     (lambda w: replay.sample(jnp.zeros((1, 2), "bfloat16"), replay.init(1, 2, 1, 2)), "bfloat16"),
@@ -259,10 +241,7 @@ FUNCTIONS = [
     (lambda w: interfaces_common.prepared_starts(0, w.mdp, 2), "key = 0: must be one key"),
     (lambda w: interfaces_common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),
     (lambda w: vae.prior(w.model, -1.0), "variance = -1.0: must be greater than 0"),
-    (
-        lambda w: readout.plausible_classes(w.belief_of(mean=w.x * NAN), w.means),
-        "belief.mean = nan",
-    ),
+    (lambda w: readout.plausible_classes(w.belief_of(mean=NAN), w.means), "belief.mean = nan"),
     (lambda w: information(w.x), "std = 0.0: must be greater than 0"),
     (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
     (lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4)), "action = 4"),
@@ -283,10 +262,7 @@ FUNCTIONS = [
     (lambda w: train(w, *[(3, 4, 2)] * 2, number=NAN), "bank of camera = nan"),
     (lambda w: train(w, *[(3, 0, 2)] * 2), "rows in the bank of camera = 0"),
     (lambda w: train(w, *[(1, 4, 2)] * 2), "bank has one class with 4 looks: must be two or more"),
-    (
-        lambda w: train(w, *[(3, 4, 2)] * 2, params=jax.tree.map(lambda x: x * NAN, w.params)),
-        "losses = nan: must be finite; scale features",
-    ),
+    (lambda w: train(w, *[(3, 4, 2)] * 2, scale=NAN), "losses = nan: must be finite; scale feat"),
     (lambda w: log_likelihood(w, samples=0), "samples = 0"),
     (lambda w: log_likelihood(w, (1.0,)), "reconstruction_weights has 1 entries"),
     (lambda w: log_likelihood(w, (0.0, 1.0)), "reconstruction_weights = 0.0"),
@@ -298,38 +274,23 @@ FUNCTIONS = [
     (lambda w: retrain(w, detector=3), "detector is a int; must be a Classifier"),
     (lambda w: w.filter.update(w.belief, w.seen, w.look, 2), "modality = 2"),
     (
-        lambda w: w.filter.update(w.belief, w.seen, jnp.full(3, 1 / 3), 0),
+        lambda w: w.filter.update(w.belief, w.seen, THIRDS, 0),
         "features of camera has the shape (3,)",
     ),
     (lambda w: w.filter.update(w.belief, w.seen, 2 * w.look, 0), "features = 1.5"),
     (lambda w: w.in_place.together({2: w.look}), "modality = 2: must be 0 (camera)"),
-    (
-        lambda w: readout.mixture(w.filter.classes, jnp.array([0.5, 0.25, 0.5])),
-        "sum of probabilities = 1.25",
-    ),
+    (lambda w: readout.mixture(w.filter.classes, 1.5 * THIRDS), "sum of probabilities = 1.5"),
     (lambda w: readout.plausible_classes(w.belief, w.means * NAN), "class_means = nan"),
     (
-        lambda w: w.filter.class_probabilities(Belief(jnp.zeros(3), jnp.ones(3))),
-        "belief.mean has the shape (3,): must be (2,)",
+        lambda w: w.filter.class_probabilities(Belief(THIRDS, THIRDS)),
+        "belief.mean has the shape (3,)",
     ),
     (lambda w: w.models.bayes.log_likelihoods(2 * w.look, 0), "features = 1.5"),
     (lambda w: w.models.detect(2, w.lidar, np.ones(683), 0.0, 1.0), "modality = 2"),
-    (
-        lambda w: make_mdp(SMOKE, dataclasses.replace(w.models, fusion=Plain())),
-        "models.fusion = Plain",
-    ),
-    (
-        lambda w: make_mdp(SMOKE, w.models, Bank((jnp.zeros((3, 4, 3)),) * 2)),
-        "looks of camera has the shape (3, 4, 3)",
-    ),
-    (
-        lambda w: make_mdp(SMOKE, w.models, Bank((jnp.zeros((3, 0, 2)),) * 2)),
-        "looks at each class = 0",
-    ),
-    (
-        lambda w: jaxsense.detections(w.key, changed("viewpoint", max_distance=1.3), w.models, 1),
-        "distance of looks by the camera = 1.29",
-    ),
+    (lambda w: make_mdp(SMOKE, w.fused(Plain())), "models.fusion = Plain"),
+    (lambda w: mdp_of(w, jnp.zeros((3, 4, 3))), "looks of camera has the shape (3, 4, 3)"),
+    (lambda w: mdp_of(w, jnp.zeros((3, 0, 2))), "looks at each class = 0"),
+    (lambda w: jaxsense.detections(w.key, FARTHER, w.models, 1), "looks by the camera = 1.29"),
     (lambda w: sim.cut_out(w.lidar, np.ones(720), 0.0), "readings of lidar has the shape (720,)"),
     (lambda w: sim.cut_out(w.lidar, np.ones(683), 90.0), "bearing = 90.0"),
     (lambda w: sim.cut_out(w.lidar, -np.ones(683), 0.0), "readings of lidar = -1.0"),
@@ -358,15 +319,9 @@ FUNCTIONS = [
     (lambda w: jaxsense.score(jaxsense.make("map-v0"), nop, agent="lidar"), "agent = 'lidar'"),
     (lambda w: jaxsense.score("map-v0", []), "policy = []: must be one policy or"),
     (lambda w: jaxsense.score("map-v0", nop, episodes=0), "episodes = 0"),
-    (
-        lambda w: tasks.mean_return(w.key, "map-v0", lambda key, x: jnp.int32(4), 1),
-        "actions from 0 to 3",
-    ),
+    (lambda w: tasks.mean_return(w.key, "map-v0", lambda key, x: 4, 1), "actions from 0 to 3"),
     (lambda w: estimate(np.ones((2, 2))), "values has the shape (2, 2): must be (any,)"),
-    (
-        lambda w: jaxsense.make("map-v0").step(w.key, w.state, jnp.zeros(2, int)),
-        "action has the shape (2,)",
-    ),
+    (lambda w: jaxsense.make("map-v0").step(w.key, w.state, BAD[:2]), "action has the shape (2,)"),
     (lambda w: jaxsense.learn(w.key, SMOKE, until="x"), "until = 'x': must be one of scenes"),
 ]
 
