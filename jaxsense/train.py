@@ -96,9 +96,7 @@ def main(
       change: changes a preset in your own program, before the other options do.
       policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
-    monitor = Monitor(warn=_warn)
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
-    is_quiet = arguments.quiet
     if is_helper := bool(arguments.process_index):
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     console = rich.console.Console(quiet=arguments.quiet)
@@ -110,9 +108,9 @@ def main(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
-                quiet=is_quiet,
+                quiet=arguments.quiet,
             )
-            _train(arguments, run, monitor, console, policies)
+            _train(arguments, run, console, policies)
         devices.leave()
     if is_helper:
         return
@@ -187,12 +185,11 @@ def _open(arguments: Arguments) -> Iterator[RunDirectory]:
 def _train(
     arguments: Arguments,
     run: RunDirectory,
-    monitor: Monitor,
     console: rich.console.Console,
     policies: OwnPolicies | None,
 ) -> None:
     """Trains the seeds that are left with the same programs, and sums all up."""
-    config, failed = run.settings.config, dict[int, str]()
+    config, failed, monitor = run.settings.config, dict[int, str](), Monitor(warn=_warn)
     workers = devices.start(arguments.devices)
     kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
     is_left = np.array([not (path / "summary.json").exists() for path in run.seeds.values()])
@@ -208,7 +205,7 @@ def _train(
             programs = Programs(config, compiler, workers, len(left), policies)
             for seed, path in left:
                 with run.of_seed(seed, path) as of_seed:
-                    if reason := _train_one(arguments, of_seed, programs, monitor, console):
+                    if reason := _train_one(arguments, of_seed, programs, console):
                         failed[seed] = reason
                 monitor.restart()
     except Stopped:
@@ -233,11 +230,7 @@ def _end_stopped(run: RunDirectory) -> NoReturn:
 
 
 def _train_one(
-    arguments: Arguments,
-    run: RunDirectory,
-    programs: Programs,
-    monitor: Monitor,
-    console: rich.console.Console,
+    arguments: Arguments, run: RunDirectory, programs: Programs, console: rich.console.Console
 ) -> str | None:
     """Trains one seed and writes its run; returns why it failed, if it did."""
     records = [run.append_metrics]
@@ -247,20 +240,20 @@ def _train_one(
     if several := compare.several_origins(origins):
         _warn(f"{run.path}: {several}")
     with Display(console, records, quiet=arguments.quiet) as display:
-        monitor.begin(display.show)
+        programs.monitor.begin(display.show)
         try:
-            results, pictures = _results(run, programs, monitor)
+            results, pictures = _results(run, programs)
         except StageError as error:
             _warn(f"{error}; earlier checkpoints are in {run.path}")
             return str(error)
-        monitor.check_stop()
+        programs.monitor.check_stop()
         header = _header(run, origins)
-        _write(run, {**header, "timing": monitor.timing(), **results}, pictures)
+        _write(run, {**header, "timing": programs.monitor.timing(), **results}, pictures)
     return None
 
 
 def _results(
-    run: RunDirectory, programs: Programs, monitor: Monitor
+    run: RunDirectory, programs: Programs
 ) -> tuple[blocks.Results, dict[str, bytes | str]]:
     """Trains one seed and plays its missions; draws both meanwhile."""
     key, config = jax.random.key(run.settings.seed), run.settings.config

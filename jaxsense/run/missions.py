@@ -89,6 +89,10 @@ def keys_of_episode(key: Key, episode: jax.Array | int) -> tuple[Key, Key]:
     return jax.random.fold_in(arena_key, episode), jax.random.fold_in(play_key, episode)
 
 
+_Given: TypeAlias = tuple[Key, Config, Models]
+"""What all calls of the programs take first."""
+
+
 @pytree
 class _Slots:
     """B missions side by side: `[B]` episodes, chunks that they have played, and states."""
@@ -206,16 +210,16 @@ class Player:
         faults = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct((rows, *x.shape), x.dtype), no_faults(config)
         )
-        begun = key, config, jax.eval_shape(lambda: models or init(key, config))
-        options = {"mesh": mesh, "whole": len(begun), "runs_long": long, "wide_vectors": long}
+        given = key, config, jax.eval_shape(lambda: models or init(key, config))
+        options = {"mesh": mesh, "whole": 1, "runs_long": long, "wide_vectors": long}
         closed = (*mission.policies,)  # those of a user are not kept
         self._begin, self._go_on = (
             Program(compiler, _STAGE, name, closed) for name in ("begin", "go_on")
         )
         begin = functools.partial(_begin, mission)
-        slots = self._begin.compile(begin, *begun, numbers, numbers, faults, **options)
+        slots = self._begin.compile(begin, given, numbers, numbers, faults, **options)
         go_on = functools.partial(_go_on, self._recorded, mission)
-        self._go_on.compile(go_on, *begun, slots, slots, numbers, **options)
+        self._go_on.compile(go_on, given, slots, slots, numbers, **options)
 
     def wait(self) -> None:
         """Waits until the programs are compiled."""
@@ -276,7 +280,7 @@ class Player:
 
     def _play(
         self,
-        given: tuple[Key, Config, Models],
+        given: _Given,
         missions: tuple[PyTree[np.ndarray], ...],
         recorded: Int[np.ndarray, " K"],
         end: Callable[[int], None],
@@ -285,7 +289,6 @@ class Player:
         """Plays the missions in the queues of a thread, one for each of its devices.
 
         Args:
-          given: what all calls of the programs take first.
           missions: `[E]` episode, policy and faults of each.
           recorded: missions to record, the first ones of the first queue.
           end: receives the number of missions that have ended.
@@ -300,9 +303,9 @@ class Player:
         while not ledger.is_over:
             self._monitor.check_stop()
             if ledger.needs_reserve:
-                reserve = self._begin.run(*given, *_rows(missions, ledger.reserve()))
+                reserve = self._begin.run(given, *_rows(missions, ledger.reserve()))
             slots, taken = reserve if slots is None else slots, ledger.fill()
-            slots, found, first = self._go_on.run(*given, slots, reserve, taken)
+            slots, found, first = self._go_on.run(given, slots, reserve, taken)
             found, playing = devices.fetched(found), ledger.playing.copy()
             self._check(playing, missions[1], found)
             if due := [i for i, chunk in enumerate(chunks) if playing[i] == recorded[i]]:
@@ -343,14 +346,13 @@ def _with_numbers(mission: Mission, config: Config) -> Mission:
 
 def _begin(
     mission: Mission,
-    key: Key,
-    config: Config,
-    models: Models,
+    given: _Given,
     episode: Int[Array, " B"],
     policies: Int[Array, " B"],
     faults: Faults,
 ) -> _Slots:
     """Missions before their first step."""
+    key, config, models = given
     scenario = _with_numbers(mission, config)
 
     def begin(episode: jax.Array, policy: jax.Array, faults: Faults) -> MissionState:
@@ -362,9 +364,7 @@ def _begin(
 def _go_on(
     recorded: int,
     mission: Mission,
-    key: Key,
-    config: Config,
-    models: Models,
+    given: _Given,
     slots: _Slots,
     reserve: _Slots,
     taken: Int[Array, " B"],
@@ -375,6 +375,7 @@ def _go_on(
         is_new = (taken >= 0).reshape(-1, *[1] * (own.ndim - 1))
         return jnp.where(is_new, reserved[jnp.maximum(taken, 0)], own)
 
+    key, config, models = given
     scenario = _with_numbers(mission, config)
     slots = jax.tree.map(refill, slots, reserve)
     keys = jax.vmap(lambda episode: keys_of_episode(key, episode)[1])(slots.episode)

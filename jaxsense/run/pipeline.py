@@ -16,13 +16,12 @@ from jaxsense.dqn.episodes import has_optimum
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
 from jaxsense.run.files import UNFINISHED, Checkpoints
-from jaxsense.run.monitor import Monitor, StageError, Stopped, is_finite
+from jaxsense.run.monitor import StageError, Stopped, is_finite
 from jaxsense.run.programs import Programs
 from jaxsense.sim import sensors
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, learners
-from jaxsense.training.comparison import permutations
 from jaxsense.training.measures import reliability
 from jaxsense.training.stage import Output, Progress, Stage
 
@@ -78,15 +77,11 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
     grouped = {name: x for name, x in outputs.items() if name == "grouped"}
 
     def agent(modality: str, values: Output) -> blocks.Agent:
-        others = jax.tree.map(np.asarray, outputs.get(f"numbers_{modality}", []))
-        return make.agent(
-            config,
-            jax.tree.map(np.asarray, outputs[f"policies_{modality}"]),
-            permutations(config),
-            curves[learner(config, modality)]["seconds"].tolist(),
-            dict(zip(config.evaluation.num_pois, others, strict=True)),
-            has_optimum(outputs["fusion"], values, is_sound),
-        )
+        names = f"policies_{modality}", f"numbers_{modality}"
+        rewards, others = (jax.tree.map(np.asarray, outputs.get(name, [])) for name in names)
+        seconds = curves[learner(config, modality)]["seconds"].tolist()
+        is_known = has_optimum(outputs["fusion"], values, is_sound)
+        return make.agent(config, rewards, seconds, others, is_known)
 
     return Learned(
         models=stages.models(outputs, config),
@@ -229,15 +224,8 @@ class _Training:
             return state, {**self._report(stage, chunk, progress), "seconds": seconds}
 
         try:
-            # Nobody but `run_chunks` holds the first state, so that it can let go of it.
-            state, self.curves[stage.name] = run_chunks(
-                stage,
-                self._begin(stage, inputs),
-                self._no_curves(stage),
-                advance,
-                self.programs.monitor,
-                self.checkpoints,
-            )
+            # Nobody but `_run_chunks` holds the first state, so that it can let go of it.
+            state = self._run_chunks(stage, self._begin(stage, inputs), advance)
         except StageError as error:
             if not stage.is_optional:
                 raise
@@ -245,6 +233,49 @@ class _Training:
             self.curves[stage.name] = self._no_curves(stage)
             return _failed(programs.shapes.result().output)
         return programs.finish(config, state, inputs)
+
+    def _run_chunks(
+        self, stage: Stage, state: Output, run: Callable[[int, Output], tuple[Output, Curves]]
+    ) -> Output:
+        """Runs a training from where it was last saved; saves it once a minute, and when it stops.
+
+        Args:
+          stage: with chunks.
+          state: first state.
+          run: `(chunk, state) -> (state, metrics)`. The state before a `StageError` is saved.
+
+        Returns:
+          The last state.
+        """
+        name, curves = f"{UNFINISHED}/{stage.name}", self._no_curves(stage)
+
+        def save(state: Output) -> None:
+            self.checkpoints.save(name, {"state": state, "curves": curves})
+
+        if found := self.checkpoints.load_or_forget(name, {"state": state, "curves": curves}):
+            state, curves = found["state"], jax.tree.map(np.array, found["curves"])
+        saved = time.monotonic()
+        for chunk in range(np.count_nonzero(np.isfinite(curves["seconds"])), stage.chunks):
+            try:
+                after, metrics = run(chunk, state)
+            except StageError as error:
+                try:
+                    save(state)
+                except OSError as lost:
+                    reason = f"{error}; cannot save the last finite state ({lost})"
+                    raise StageError(reason) from error
+                raise
+            state = after
+            for metric, values in metrics.items():
+                first = chunk * -(-len(curves[metric]) // stage.chunks)
+                curves[metric][first : first + len(values)] = values
+            if time.monotonic() - saved > _SAVE_PERIOD or self.programs.monitor.is_stopping:
+                save(state)
+                saved = time.monotonic()
+            if chunk + 1 < stage.chunks:
+                self.programs.monitor.check_stop()
+        self.curves[stage.name] = curves
+        return state
 
     def _report(self, stage: Stage, chunk: int, progress: Progress) -> Curves:
         """Reports a chunk, checks its losses, and returns the steps' metrics."""
@@ -285,53 +316,3 @@ def _failed(shapes: Output) -> Output:
         return np.full(x.shape, np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
 
     return jax.tree.map(fail, shapes)
-
-
-def run_chunks(
-    stage: Stage,
-    state: Output,
-    curves: Curves,
-    run: Callable[[int, Output], tuple[Output, Curves]],
-    monitor: Monitor,
-    checkpoints: Checkpoints,
-) -> tuple[Output, Curves]:
-    """Runs a training from where it was last saved; saves it once a minute, and when it stops.
-
-    Args:
-      stage: with chunks.
-      state: first state.
-      curves: before the first chunk.
-      run: `(chunk, state) -> (state, metrics)`. The state before a `StageError` is saved.
-      monitor: asked whether to stop.
-      checkpoints: where to save the training.
-
-    Returns:
-      The last state and the curves of all chunks.
-    """
-    name = f"{UNFINISHED}/{stage.name}"
-
-    def save(state: Output) -> None:
-        checkpoints.save(name, {"state": state, "curves": curves})
-
-    if found := checkpoints.load_or_forget(name, {"state": state, "curves": curves}):
-        state, curves = found["state"], jax.tree.map(np.array, found["curves"])
-    saved = time.monotonic()
-    for chunk in range(np.count_nonzero(np.isfinite(curves["seconds"])), stage.chunks):
-        try:
-            after, metrics = run(chunk, state)
-        except StageError as error:
-            try:
-                save(state)
-            except OSError as lost:
-                raise StageError(f"{error}; cannot save the last finite state ({lost})") from error
-            raise
-        state = after
-        for metric, values in metrics.items():
-            first = chunk * -(-len(curves[metric]) // stage.chunks)
-            curves[metric][first : first + len(values)] = values
-        if time.monotonic() - saved > _SAVE_PERIOD or monitor.is_stopping:
-            save(state)
-            saved = time.monotonic()
-        if chunk + 1 < stage.chunks:
-            monitor.check_stop()
-    return state, curves

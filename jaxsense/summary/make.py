@@ -11,6 +11,7 @@ from jaxsense.mission.outcome import REASONS
 from jaxsense.summary import blocks
 from jaxsense.summary.blocks import Case, Missions
 from jaxsense.summary.compare import REFERENCE, Measured, differences
+from jaxsense.training.comparison import permutations
 
 _UNAMBIGUOUS = 0.9  # share of looks that leave only the class; above, the class is unambiguous
 _AS_GOOD = 0.01  # tolerance of the reward below the optimum
@@ -35,9 +36,8 @@ def plain(measured: PyTree) -> PyTree:
 def agent(
     config: Config,
     rewards: _Rewards,
-    is_permutation: np.ndarray,
     seconds: Sequence[float],
-    others: Mapping[int, _Rewards],
+    others: Sequence[_Rewards] = (),
     has_optimum: bool = True,
 ) -> blocks.Agent:
     """One modality's block of `dqn`.
@@ -46,13 +46,14 @@ def agent(
       config: all settings.
       rewards: by policy, `[S]` total reward of an episode and `[S]` reward of its first action,
         from every state of the map, then from `config.evaluation.num_starts` random starts.
-      is_permutation: for each state of the map, whether all classes differ, as in the paper.
       seconds: of the training, chunk by chunk.
-      others: `rewards` with other numbers of PoIs, whose last starts are the random ones.
+      others: `rewards` with each of `config.evaluation.num_pois`, whose last starts are the random
+        ones.
       has_optimum: whether `optimal` is the optimum; what rests on it is None otherwise, and where
         another policy gets clearly more.
     """
     num_starts, env_steps = config.evaluation.num_starts, config.dqn.epochs * config.dqn.num_envs
+    is_permutation = permutations(config)  # all classes differ, as in the paper
     num_states = len(is_permutation)
     returns = _returns(rewards, num_starts, has_optimum)
     has_optimum = returns["optimal"] is not None
@@ -74,9 +75,9 @@ def agent(
         "env_steps_per_s": env_steps / sum(seconds),
     }
     if others:
-        block["other_numbers"] = {
-            str(number): _returns(each, num_starts, has_optimum) for number, each in others.items()
-        }
+        numbers = map(str, config.evaluation.num_pois)
+        of_numbers = (_returns(each, num_starts, has_optimum) for each in others)
+        block["other_numbers"] = dict(zip(numbers, of_numbers, strict=True))
     return block
 
 

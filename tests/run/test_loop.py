@@ -4,6 +4,7 @@ import gc
 import tempfile
 import time
 import weakref
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,8 +19,7 @@ from jaxsense.run import devices, pipeline
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.pipeline import run_chunks
-from jaxsense.run.programs import Programs
+from jaxsense.run.programs import Programs, Shapes
 from jaxsense.training import stages
 from jaxsense.training.stage import Progress, Stage
 
@@ -245,10 +245,8 @@ def test_an_error_of_any_kind_stops_the_other_stages(toy, monkeypatch):
 def curves(chunks, done=0):
     """Chunks count themselves, and take a second."""
     count = np.arange(chunks, dtype=np.float32)
-    return {
-        "chunk": np.where(count < done, count, np.nan),
-        "seconds": np.where(count < done, 1, np.nan),
-    }
+    found = {"chunk": count, "seconds": np.ones_like(count)}
+    return {name: np.where(count < done, x, np.nan) for name, x in found.items()}
 
 
 def go_on(path, chunks, run, monitor=None):
@@ -258,9 +256,12 @@ def go_on(path, chunks, run, monitor=None):
         run(chunk)
         return state + 1, {"chunk": [chunk], "seconds": [1.0]}
 
-    stage = Stage("jmvae", lambda key, config: (), chunks=chunks)
-    none, checkpoints = curves(chunks), Checkpoints(path)
-    return run_chunks(stage, np.float32(0), none, counted, monitor or Monitor(), checkpoints)
+    stage = Stage("jmvae", lambda key, config: (), steps=chunks, chunks=chunks)
+    (shapes := Future[Shapes]()).set_result(Shapes(None, ("chunk",)))
+    of_stage, monitor = SimpleNamespace(shapes=shapes), monitor or Monitor()
+    programs = SimpleNamespace(monitor=monitor, of=lambda stage: of_stage)
+    training = pipeline._Training(KEY, programs, Checkpoints(path))
+    return training._run_chunks(stage, np.float32(0), counted), training.curves["jmvae"]
 
 
 def check(found, chunks, done):

@@ -9,7 +9,6 @@ from jaxsense.config import PRESETS, Config, JmvaeConfig
 from jaxsense.config.learning import EvaluationConfig
 from jaxsense.config.scene import ArenaConfig
 from jaxsense.summary import make
-from jaxsense.training.comparison import permutations
 
 CONFIG = PRESETS["smoke"]
 RETURNS = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal"
@@ -28,7 +27,7 @@ SMALL = Config(
     modalities=("camera",),
     arena=ArenaConfig(num_pois=2, classes=("green cylinder", "red cylinder")),
     jmvae=JmvaeConfig(reconstruction_weights=(1.0,)),
-    evaluation=EvaluationConfig(num_starts=3),
+    evaluation=EvaluationConfig(num_starts=3, num_pois=(9,)),
 )
 
 
@@ -45,8 +44,7 @@ def test_figures_of_policies_as_worked_by_hand():
     )
     total = np.concatenate([of_states, of_starts], axis=1)
     rewards = {name: (x, x / 2) for name, x in zip(names, total, strict=True)}
-    different = permutations(SMALL)
-    figures = make.agent(SMALL, rewards, different, [2.0, 3.0], {9: rewards})
+    figures = make.agent(SMALL, rewards, [2.0, 3.0], [rewards])
     expected = {"return": 1.0, "optimal": 1.1, "greedy": 1.1, "naive": 0.6, "random": -0.5}
     assert {name: figures[name] for name in expected} == pytest.approx(expected)
     assert figures["fraction_of_optimal"] == pytest.approx(1 / 1.1)
@@ -56,7 +54,7 @@ def test_figures_of_policies_as_worked_by_hand():
     assert figures["one_step"] == pytest.approx(one_step)
     assert (figures["optimal_states"], figures["num_states"]) == (13, 16)
     assert (figures["optimal_permutations"], figures["num_permutations"]) == (6, 8)
-    without = make.agent(SMALL, rewards, different, [2.0, 3.0], {}, has_optimum=False)
+    without = make.agent(SMALL, rewards, [2.0, 3.0], has_optimum=False)
     ends = "optimal", "fraction_of_optimal", "optimal_states", "optimal_permutations"
     assert [without[end] for end in ends] == [None] * 4
     assert without["one_step"]["optimal"] is None
@@ -64,20 +62,20 @@ def test_figures_of_policies_as_worked_by_hand():
     # More than the optimum, of which .011 and two standard errors are let pass: .020, then .038.
     for more, is_null in (([0.02, 0.03, 0.04], True), ([0.0, 0.0, 0.05], False)):
         better = {**rewards, "greedy": (total[1] + np.append(np.zeros(16), more), total[1])}
-        found = make.agent(SMALL, better, different, [1.0], {9: better})
+        found = make.agent(SMALL, better, [1.0], [better])
         for block in (found, found["other_numbers"]["9"]):
             assert (block["optimal"] is None) is is_null
         assert (found["optimal_states"] is None) is is_null
     # Of other numbers of PoIs alone: only theirs has no optimum then.
     better = {**rewards, "greedy": (total[1] + 0.03, total[1])}
-    found = make.agent(SMALL, rewards, different, [1.0], {9: better})
+    found = make.agent(SMALL, rewards, [1.0], [better])
     assert found["optimal"] == pytest.approx(1.1)
     assert found["other_numbers"]["9"]["optimal"] is None
     # .010 more without an error is within a share of .01 of 1.1.
     better = {**rewards, "greedy": (total[1] + 0.010, total[1])}
-    assert make.agent(SMALL, better, different, [1.0], {})["optimal"] == pytest.approx(1.1)
+    assert make.agent(SMALL, better, [1.0])["optimal"] == pytest.approx(1.1)
     none = dict.fromkeys(names, (np.zeros(19), np.zeros(19)))
-    nothing = make.agent(SMALL, none, permutations(SMALL), [1.0], {})
+    nothing = make.agent(SMALL, none, [1.0])
     assert "other_numbers" not in nothing
     assert nothing["fraction_of_optimal"] is None
 
