@@ -27,7 +27,7 @@ from jaxsense.config.scene import MAX_BEARING
 from jaxsense.config.section import Checked
 from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
-from jaxsense.dqn.team import Team
+from jaxsense.dqn.team import Team, to_go
 from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps
 from jaxsense.mission.decide import action_of
@@ -196,15 +196,15 @@ def _decide(config: Config) -> Function:
     ) -> Arrays:
         """The robot's choice: the action of the highest value."""
         team = Team(*of_team)
-        ways = team.poses[:, None, None, :2] - jnp.swapaxes(looked_from, 0, 1)[team.modality]
-        to_go = jax.vmap(models.novelty.to_go)(jnp.linalg.norm(ways, axis=-1), team.modality)
+        travel = make_travel(config)
+        apart = lambda place, poi, m: jnp.linalg.norm(looked_from[poi, m] - place[None], axis=-1)  # noqa: E731
         known = Known(
             belief=Belief(mean, std),
             # The policy of a run reads neither.
             looks=jnp.zeros((mean.shape[0], modalities), jnp.int32),
             log_posterior=jnp.zeros((mean.shape[0], classes)),
             team=team,
-            times=make_travel(config).times(team, to_go),
+            times=travel.times(team, to_go(models.novelty, travel, team, apart)),
             robot=robot,
         )
         values = POLICIES["latent"](key, models, known)

@@ -30,6 +30,7 @@ from jaxsense.vae.readout import Bayes, Readout
 
 _NO_SEARCH = Search()
 _FEWEST_BEAMS = 3  # fewer show no profile
+_STOPS_INSIDE = 0.02  # m, of the farthest view of a PoI
 _UNSEEN_VARIANCE = 20.0  # of each latent dimension of the belief before any look
 
 
@@ -204,8 +205,8 @@ def make_agent(config: Config) -> Agent:
 
 
 def make_travel(config: Config) -> Travel:
-    """How robots travel, according to the team's settings."""
-    return Travel(config.team.travel.view_distance)
+    """How robots travel until they are in view of a PoI."""
+    return Travel(config.navigation.view_range - _STOPS_INSIDE)
 
 
 def make_readout(config: Config, classes: Belief) -> Readout:

@@ -20,7 +20,6 @@ FIELDS = [(name, f) for name, section in SECTIONS.items() for f in dataclasses.f
 # With those of a section within a section.
 PARTS = {
     **SECTIONS,
-    "team.travel": SMOKE.team.travel,
     "mission.localisation": SMOKE.mission.localisation,
     "mission.communication": dataclasses.replace(SMOKE.mission.communication, own_maps=True),
 }

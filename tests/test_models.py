@@ -44,7 +44,7 @@ def test_an_agent_is_that_of_its_task():
     one, team = models.make_agent(SMOKE), models.make_agent(TEAM)
     assert (one.num_pois, one.travel) == (3, None)
     assert team.num_pois == 7
-    assert team.travel.view_distance == TEAM.team.travel.view_distance
+    assert team.travel.view_distance == pytest.approx(TEAM.navigation.view_range - 0.02)
 
 
 def test_networks_that_learn_from_scans_see_windows_in_frames():

@@ -152,27 +152,15 @@ class MdpConfig(Section, place="mdp"):
         require(is_named, self, "reward", "must be paper, nats or package.module:function")
 
 
-class TravelConfig(Section, place="team.travel"):
-    """The travel model, see `dqn.Travel`.
-
-    Attributes:
-      view_distance: Distance from which a robot looks at a PoI, in metres.
-    """
-
-    view_distance: Traced[float] = limited(0.96, at_least=0)
-
-
 class TeamConfig(Section, place="team"):
     """The MDP with travel (`dqn.task` = team), in which robots have positions and looks take time.
 
     Attributes:
-      travel: Model of the time that a robot takes to look at a PoI.
       num_pois: Minimum and maximum number of PoIs in an episode.
       sides: Shortest and longest side of an episode's arena, in metres.
       second_cost: Cost of each second in which a robot works, in units of the reward.
     """
 
-    travel: TravelConfig = TravelConfig()
     num_pois: tuple[int, int] = limited((2, 4), at_least=1, at_most=64)
     sides: Traced[tuple[float, float]] = limited((3.0, 4.0), above=0, at_most=100)
     second_cost: Traced[float] = limited(0.0, at_least=0)

@@ -10,7 +10,6 @@ from jaxsense.config.learning import (
     JmvaeConfig,
     MdpConfig,
     TeamConfig,
-    TravelConfig,
 )
 from jaxsense.config.mission import MissionConfig, NavigationConfig
 from jaxsense.config.scene import (
@@ -99,7 +98,7 @@ _NOISY = Config(
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
     mdp=MdpConfig(reward="nats", look_cost=0.1),
     dqn=DqnConfig(hidden=(64, 64), epochs=600),
-    team=TeamConfig(travel=TravelConfig(view_distance=3.5), sides=(4.0, 9.0)),
+    team=TeamConfig(sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_looks=128),
     navigation=NavigationConfig(view_range=4.0),
     mission=MissionConfig(

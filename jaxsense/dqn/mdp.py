@@ -24,7 +24,16 @@ from jaxsense.config import MdpConfig
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Fusion, Index, Key, Novelty, Scene, call, pytree
 from jaxsense.dqn.rewards import Reward
-from jaxsense.dqn.team import Steps, Team, Teams, Travel, alone, num_features, surroundings
+from jaxsense.dqn.team import (
+    Steps,
+    Team,
+    Teams,
+    Travel,
+    alone,
+    num_features,
+    surroundings,
+    to_go,
+)
 
 _RECENT = 4  # looks by a sensor at a PoI whose places are remembered
 _NEVER = 1e6  # m, a place far from everything, where no look has been
@@ -135,12 +144,11 @@ class Mdp:
         return self.travel.times(state.team, self.to_go(state))
 
     def to_go(self, state: "State") -> Float[Array, "R N"]:
-        """Metres from each robot to where its look at each PoI is new."""
-        team, novelty = state.team, self.novelty
-        if novelty is None or (places := state.looked_from) is None:
-            return jnp.zeros(team.heads.shape)
-        of_robot = lambda pose, m: novelty.to_go(_apart(pose, places[:, m]), m)  # noqa: E731
-        return jax.vmap(of_robot)(team.poses, team.modality)
+        """Metres that each robot goes round each PoI until its look is new."""
+        if self.novelty is None or (places := state.looked_from) is None:
+            return jnp.zeros(state.team.heads.shape)
+        apart = lambda place, poi, modality: _apart(place, places[poi, modality])  # noqa: E731
+        return to_go(self.novelty, self.travel, state.team, apart)
 
     @property
     def novelty(self) -> Novelty | None:
@@ -300,6 +308,7 @@ def begin(
     chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities))
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
+    place_key, key = (None, key) if mdp.novelty is None else jax.random.split(key)
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
     beliefs = jax.vmap(functools.partial(_looked_at, mdp))(looks, seen, first)
     return State(
@@ -312,7 +321,7 @@ def begin(
         asks=team.works,
         agent=jnp.argmax(team.works).astype(jnp.int32),
         looked=jnp.zeros(len(team.works)),
-        looked_from=None if mdp.novelty is None else jnp.full((*seen.shape, _RECENT, 2), _NEVER),
+        looked_from=None if mdp.novelty is None else _earlier(place_key, mdp, team, seen),
         seconds=jnp.float32(0.0),
     )
 
@@ -342,7 +351,7 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     passes = ~jnp.any(asks) & ~terminated
 
     goals = team.positions.at[target].get(mode="clip")
-    to_go = mdp.to_go(state).at[robots, target].get(mode="clip")
+    to_go = _to_go(mdp, state, target, goals)
     times = jax.vmap(mdp.travel.seconds)(team.poses, goals, to_go)
     left = times - state.looked
     looker = jnp.argmin(jnp.where(works, left, jnp.inf)).astype(jnp.int32)
@@ -389,8 +398,11 @@ def _look(
     modality, weight, looked_from = mdp.sensor(state.team, looker), 1.0, state.looked_from
     if mdp.novelty is not None and looked_from is not None:
         earlier = looked_from[place, modality]
-        weight = mdp.novelty.weight(_apart(pose, earlier), modality)
-        latest = jnp.concatenate([pose[None, :2], earlier[:-1]])
+        weight = mdp.novelty.weight(_apart(pose[:2], earlier), modality)
+        # A robot alone is where the PoIs are: its looks are all new.
+        is_alone = jnp.all(pose[:2] == state.team.positions[place])
+        here = jnp.where(is_alone, _NEVER, pose[:2])
+        latest = jnp.concatenate([here[None], earlier[:-1]])
         looked_from = looked_from.at[place, modality].set(latest)
 
     def look(modality: int) -> tuple[Belief, Scene]:
@@ -419,9 +431,37 @@ def _look(
     return changed, jnp.where(exists, jnp.where(is_nop, 0.0, of_look), jnp.nan)
 
 
-def _apart(pose: Float[Array, "3"], places: Float[Array, "*S 2"]) -> Float[Array, "*S"]:
-    """Distances of a robot from places, in metres."""
-    return jnp.linalg.norm(places - pose[:2], axis=-1)
+def _to_go(
+    mdp: Mdp, state: State, target: Int[Array, " R"], goals: Float[Array, "R 2"]
+) -> Float[Array, " R"]:
+    """Metres that each robot goes round its target, away from the nearest earlier look."""
+    novelty, team, places = mdp.novelty, state.team, state.looked_from
+    if novelty is None or places is None:
+        return jnp.zeros(len(target))
+
+    def of_robot(pose: jax.Array, modality: jax.Array, poi: jax.Array, goal: jax.Array):
+        earlier = places.at[poi, modality].get(mode="clip")
+        arrival = mdp.travel.arrival(pose, goal)
+        apart = _apart(arrival, earlier)
+        (x, y), (other_x, other_y) = arrival - goal, earlier[jnp.argmin(apart)] - goal
+        is_left = x * other_y - y * other_x > 0
+        return jnp.where(is_left, -1.0, 1.0) * novelty.to_go(apart, modality)
+
+    return jax.vmap(of_robot)(team.poses, team.modality, target, goals)
+
+
+def _apart(place: Float[Array, "2"], places: Float[Array, "K 2"]) -> Float[Array, " K"]:
+    """Distances from earlier looks, in metres."""
+    return jnp.linalg.norm(places - place[None], axis=-1)
+
+
+def _earlier(key: Key, mdp: Mdp, team: Team, seen: Bool[Array, "N M"]) -> Float[Array, "N M K 2"]:
+    """Places of the looks before the start: random ones in view of their PoIs."""
+    angle = jax.random.uniform(key, seen.shape, maxval=2 * jnp.pi)
+    around = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    places = team.positions[:, None] + mdp.travel.view_distance * around
+    last = jnp.where(seen[..., None], places, _NEVER)
+    return jnp.full((*seen.shape, _RECENT, 2), _NEVER).at[:, :, 0].set(last)
 
 
 def _looked_at(mdp: Mdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:

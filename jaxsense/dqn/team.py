@@ -1,6 +1,6 @@
 """Robots and points of interest: where they are, and how long it takes to drive and look."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -106,9 +106,14 @@ class Known:
 
 @pytree
 class Steps:
-    """No travel: a look takes one step, from anywhere."""
+    """No travel: a look takes one step, from anywhere; see `Travel`."""
 
     look_seconds = 1.0
+
+    def arrival(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Where the robot is."""
+        del place
+        return pose[:2]
 
     def seconds(
         self,
@@ -139,10 +144,12 @@ class Steps:
 
 @pytree
 class Travel:
-    """A robot that turns to a PoI, drives straight until it is near enough, and looks.
+    """A robot that turns to a PoI, drives straight until it sees it, and looks.
+
+    Where such a look would not be new, it goes on, round the PoI.
 
     Attributes:
-      view_distance: from which it looks, in metres.
+      view_distance: from which it sees a PoI, in metres.
       speed: in metres per second.
       turn_rate: in radians per second.
       look_seconds: duration of a look.
@@ -150,8 +157,13 @@ class Travel:
 
     view_distance: jax.Array | float
     speed: jax.Array | float = 0.2
-    turn_rate: jax.Array | float = 1.2
-    look_seconds: jax.Array | float = 0.7
+    turn_rate: jax.Array | float = 1.0
+    look_seconds: jax.Array | float = 0.45
+
+    def arrival(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Where a robot that drives to a PoI first sees it, `[2]` in metres."""
+        _, straight, along = self._way(pose, place)
+        return pose[:2] + straight * along
 
     def seconds(
         self,
@@ -164,9 +176,11 @@ class Travel:
         Args:
           pose: x [m], y [m] and yaw [rad] of the robot as it sets out.
           place: position of the PoI, in metres.
-          to_go: shortest path to where a look is new, in metres.
+          to_go: from the `arrival` to where a look is new, in metres; to the robot's right if
+            positive.
         """
-        turn, path = self._path(pose, place, to_go)
+        turn, straight, _ = self._way(pose, place)
+        path = straight + jnp.abs(to_go)
         return self.look_seconds + jnp.abs(turn) / self.turn_rate + path / self.speed
 
     def times(self, team: Team, to_go: Float[Array, "R N"]) -> Float[Array, "R N"]:
@@ -182,25 +196,53 @@ class Travel:
         to_go: Float[Array, ""] | float = 0.0,
     ) -> Float[Array, "3"]:
         """Pose of a robot some time after it set out for a PoI, see `seconds`."""
-        turn, path = self._path(pose, place, to_go)
+        turn, straight, along = self._way(pose, place)
+        beyond = jnp.abs(to_go)
         turning = jnp.minimum(jnp.abs(turn) / self.turn_rate, seconds)
-        yaw = pose[2] + jnp.sign(turn) * turning * self.turn_rate
-        driven = jnp.minimum((seconds - turning) * self.speed, path)
-        to_place = place - pose[:2]
-        along = to_place / jnp.maximum(jnp.linalg.norm(to_place), 1e-6)
-        return jnp.append(pose[:2] + driven * along, yaw)
+        driven = jnp.minimum((seconds - turning) * self.speed, straight + beyond)
+        arrival = pose[:2] + jnp.minimum(driven, straight) * along
+        # A chord of the circle from which the robot sees the PoI; then it faces the PoI again.
+        away = arrival - place
+        radius = jnp.maximum(jnp.linalg.norm(away), 1e-6)
+        angle = 2 * jnp.arcsin(jnp.clip(to_go / (2 * radius), -1.0, 1.0))
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        end = place + jnp.stack([cos * away[0] - sin * away[1], sin * away[0] + cos * away[1]])
+        share = jnp.maximum(driven - straight, 0.0) / jnp.maximum(beyond, 1e-6)
+        yaw = pose[2] + jnp.sign(turn) * turning * self.turn_rate + share * angle
+        return jnp.append(arrival + share * (end - arrival), yaw)
 
-    def _path(
-        self, pose: jax.Array, place: jax.Array, to_go: jax.Array | float
-    ) -> tuple[jax.Array, jax.Array]:
-        """`[]` radians to turn and `[]` metres to drive until a robot looks, see `seconds`."""
+    def _way(self, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """`[]` radians to turn, `[]` metres straight on until it sees, and `[2]` which way."""
         to_place = place - pose[:2]
         turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
         turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
         # At zero distance the bearing is undefined: do not turn.
         distance = jnp.linalg.norm(to_place)
         turn = jnp.where(distance > 0, turn, 0.0)
-        return turn, jnp.maximum(distance - self.view_distance, to_go)
+        straight = jnp.maximum(distance - self.view_distance, 0.0)
+        return turn, straight, to_place / jnp.maximum(distance, 1e-6)
+
+
+def to_go(
+    novelty: Novelty,
+    travel: Steps | Travel,
+    team: Team,
+    apart: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
+) -> Float[Array, "R N"]:
+    """Metres from where each robot first sees each PoI to where its look is new.
+
+    Args:
+      apart: `(place [2], poi, modality) -> [K]` distances of a place from earlier looks.
+    """
+    pois = jnp.arange(team.positions.shape[0])
+
+    def of_robot(pose: jax.Array, modality: jax.Array) -> jax.Array:
+        def of_poi(position: jax.Array, poi: jax.Array) -> jax.Array:
+            return novelty.to_go(apart(travel.arrival(pose, position), poi, modality), modality)
+
+        return jax.vmap(of_poi)(team.positions, pois)
+
+    return jax.vmap(of_robot)(team.poses, team.modality)
 
 
 @pytree

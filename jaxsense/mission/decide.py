@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsense.config.mission import MARGIN
 from jaxsense.core.types import Index, Key, call
 from jaxsense.dqn.policies import Known, best
-from jaxsense.dqn.team import Team
+from jaxsense.dqn.team import Team, to_go
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -130,17 +130,14 @@ def known_to(mission: Mission, models: Models, state: MissionState, robot: Index
         works=state.robots.phase < ENDED,
         target=state.robots.target,
     )
-    pois = jnp.arange(mission.config.arena.num_pois)
-    of_pose = lambda pose, poi, m: me.map.apart(pose[None, :2], poi, m)[0]  # noqa: E731
-    of_pois = jax.vmap(of_pose, (None, 0, None))
-    apart = jax.vmap(of_pois, (0, None, 0))(team.poses, pois, team.modality)
-    to_go = jax.vmap(models.novelty.to_go)(apart, team.modality)
+    travel = make_travel(mission.config)
+    apart = lambda place, poi, modality: me.map.apart(place[None], poi, modality)[0]  # noqa: E731
     return Known(
         belief=known.belief,
         looks=known.times_seen,
         log_posterior=known.log_posterior,
         team=team,
-        times=make_travel(mission.config).times(team, to_go),
+        times=travel.times(team, to_go(models.novelty, travel, team, apart)),
         robot=jnp.asarray(robot),
     )
 

@@ -15,6 +15,7 @@ from jaxsense.config import Config, ConfigError, from_plain
 from jaxsense.config.options import without_former
 from jaxsense.config.section import require_32_bits
 from jaxsense.core.types import Key, placed
+from jaxsense.dqn.team import Travel
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.task import Scaling, Task, fixed_draws, key_of_seed
@@ -40,6 +41,9 @@ TASKS = {
 
 # The others follow from the settings.
 PARTS = "detectors", "jmvae", "fusion", "novelty", "look_values", "q_networks"
+
+
+_TRAVEL = Travel(0.96, turn_rate=1.2, look_seconds=0.7)  # with which tasks were frozen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -168,7 +172,8 @@ def task_of(
         mdp = mdp.of(config.modalities.index(agent))
     else:
         # A task is a whole mission.
-        teams = dataclasses.replace(mdp.teams, partly_seen=0.0, is_random=False)
+        fixed = {"travel": _TRAVEL, "partly_seen": 0.0, "is_random": False}
+        teams = dataclasses.replace(mdp.teams, **fixed)
         mdp = dataclasses.replace(mdp, robots=jnp.array(config.modality_of_robot), teams=teams)
     return Task(mdp, parts, scaling, returns, name, agent, config.modalities)
 

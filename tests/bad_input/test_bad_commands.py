@@ -81,7 +81,7 @@ TRAIN = [
     (["--config", "sensor.json"], "sensors.x = {'make': 'a:b'}: missing setting attribute"),
     (["--resume", "full"], "resume = 'full': is not a run directory: it has no config.json"),
     (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),
-    (["--team.travel.view-distanc", "1"], "; did you mean --team.travel.view-distance?"),
+    (["--team.second-cos", "1"], "; did you mean --team.second-cost?"),
     (["--team.num-pois", "3"], "option = '--team.num-pois': expected 2 arguments"),
     (
         ["--mdp.partly-seen-starts", "maybe"],

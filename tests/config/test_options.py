@@ -166,7 +166,7 @@ def test_all_help_explains_every_field(capsys, monkeypatch):
 def test_every_kind_of_option_is_read(tmp_path):
     words = """--preset smoke --arena.side 4 --arena.num_pois=4 --mdp.partly-seen-starts
         --arena.colours.red 1 0 .5 --arena.shapes.cube.half-sides .5 .5
-        --team.travel.view-distance .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
+        --team.second-cost .3 --robots camera camera lidar --cache NONE --quiet --no-quiet
         --devices none --dqn.hidden 8 --dqn.observe live --seed 3 --seed 4"""
     arguments = train.parse(words.split())
     config, smoke = arguments.settings.config, PRESETS["smoke"]
@@ -176,9 +176,7 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert config.arena.colours == {**smoke.arena.colours, "red": (1.0, 0.0, 0.5)}
     assert config.arena.shapes == {**smoke.arena.shapes, "cube": Shape("box", (0.5, 0.5))}
     assert config.mdp.partly_seen_starts is True
-    assert config.team == dataclasses.replace(
-        smoke.team, travel=dataclasses.replace(smoke.team.travel, view_distance=0.3)
-    )
+    assert config.team == dataclasses.replace(smoke.team, second_cost=0.3)
     assert config.robots == ("camera", "camera", "lidar")
     assert config.dqn == dataclasses.replace(smoke.dqn, hidden=(8,), observe="live")
     # Of a stored run, of which other options change settings; then without an option's value.

@@ -20,7 +20,7 @@ from jaxsense.config import (
     as_plain,
     from_plain,
 )
-from jaxsense.config.learning import TeamConfig, TravelConfig
+from jaxsense.config.learning import TeamConfig
 from jaxsense.config.scene import COLOURS, MODALITIES, SHAPES, ArenaConfig
 from jaxsense.dqn import rewards
 from jaxsense.sim.sensors import on_top
@@ -65,7 +65,7 @@ def thermal(config, **changed):
 
 
 def test_a_team_of_robots_survives_json():
-    team = TeamConfig(travel=TravelConfig(view_distance=0.5), num_pois=(2, 5))
+    team = TeamConfig(num_pois=(2, 5))
     for robots in (None, ("camera", "lidar", "camera")):
         config = Config(robots=robots, team=team)
         assert from_plain(json.loads(json.dumps(as_plain(config)))) == config

@@ -16,15 +16,15 @@ import jaxsense
 from jaxsense import export
 from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief
-from jaxsense.dqn import Travel
 from jaxsense.interfaces import robot
+from jaxsense.models import make_travel
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.tasks.registry import PRETRAINED
 from jaxsense.vae import detectors, readout
 
 BATCH = 12
-TRAVEL = Travel(CONFIG.team.travel.view_distance)
+TRAVEL = make_travel(CONFIG)
 SIZES = {"pois": 3, "robots": 2, "looks": 4}
 
 
