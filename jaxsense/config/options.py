@@ -186,17 +186,21 @@ class Option:
             shown = f"{{{','.join(get_args(kind))}}}" if get_origin(kind) is Literal else None
             how["metavar"] = (shown or names.get(kind, "NAME")) if is_named else self.name
             how["nargs"] = number if is_named else number or "?"  # `read` tells if it is missing
+            how["type"] = self.value
         parser.add_argument(*[self.name] * is_named, **how)
 
-    def value(self, found: bool | str | list[str]) -> object:
-        """Reads what is given. Words of another type stay text, which the dataclass refuses."""
-        if isinstance(found, bool):
-            return found
-        words = found if isinstance(found, list) else [found]
-        if self.is_optional and [word.lower() for word in words] == ["none"]:
+    def value(self, word: str) -> object:
+        """The value of a word; one of another type stays text, which the dataclass refuses."""
+        kind, _ = self.words
+        if word is argparse.SUPPRESS:  # a positional argument that is missing
+            return word
+        if self.is_optional and word.lower() == "none":
             return None
-        values = tuple(_of_type(self.words[0], word) for word in words)
-        return values if isinstance(found, list) else values[0]
+        if kind is Path and word and word.isprintable():
+            return Path(word)
+        with contextlib.suppress(ValueError):
+            return int(word) if kind is int else float(word) if kind is float else word
+        return word
 
 
 def options_of(base: object, path: str = "", place: str | None = None) -> Iterator[Option]:
@@ -274,27 +278,17 @@ def read(base: T | type[T], argv: list[str]) -> T:
 
 def given(base: object, argv: list[str]) -> tuple[dict[str, object], list[str]]:
     """The values on a command line by their paths, and the words that belong to no option."""
-    options = [*options_of(base)]
     # Also `--num_seeds`.
     dashed = [re.sub(r"^--[^=]*", lambda name: name[0].replace("_", "-"), word) for word in argv]
-    found, rest = _Parser(options).parse_known_args(dashed)
-    words = vars(found)
-    return {o.path: o.value(words[o.path]) for o in options if o.path in words}, rest
+    found, rest = _Parser(options_of(base)).parse_known_args(dashed)
+    values = {name: tuple(x) if isinstance(x, list) else x for name, x in vars(found).items()}
+    return {name: None if x == (None,) else x for name, x in values.items()}, rest
 
 
 def _changed(plain: Mapping[str, Any], path: Sequence[str], value: object) -> dict[str, Any]:
     """Nested dictionaries with another value at a path."""
     name, *rest = path
     return {**plain, name: _changed(plain.get(name, {}), rest, value) if rest else value}
-
-
-def _of_type(kind: object, word: str) -> object:
-    """A word as a number or a path, if it is one."""
-    if kind is Path and word and word.isprintable():
-        return Path(word)
-    with contextlib.suppress(ValueError):
-        return int(word) if kind is int else float(word) if kind is float else word
-    return word
 
 
 def _unknown(words: list[str], names: list[str]) -> tuple[str, str]:

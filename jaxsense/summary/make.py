@@ -149,7 +149,8 @@ def _calibration(found: Measured) -> blocks.Calibration:
     """Whether the confidence of maps matches their accuracy, at PoIs that were detected."""
     names, is_seen = ("confidence", "is_right", "nll"), found["seen"]
     each = (_share(found[name][is_seen].sum(dtype=float), is_seen.sum()) for name in names)
-    return dict(zip(("confidence", "accuracy", "nll"), each, strict=True))
+    confidence, accuracy, nll = each
+    return {"confidence": confidence, "accuracy": accuracy, "nll": nll}
 
 
 def _share(part: int, whole: int) -> float | None:

@@ -4,6 +4,7 @@ import ast
 import time
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from refusals import NUMBERS, SMOKE, check_message
@@ -171,7 +172,8 @@ def test_what_ends_a_run_is_told_without_advice(error, expected, tmp_path, capsy
     def fails(*_):
         raise error
 
-    monkeypatch.setattr(train, "Programs", lambda *_: None)
+    programs = lambda config, compiler, *_: SimpleNamespace(monitor=compiler.monitor)  # noqa: E731
+    monkeypatch.setattr(train, "Programs", programs)
     monkeypatch.setattr(pipeline, "learn", fails)
     argv = ["--preset", "smoke", "--quiet", "--cache", "None", "--out", str(tmp_path / "run")]
     line = error_line(argv, capsys)
