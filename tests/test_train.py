@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -9,7 +10,8 @@ import jax
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from smoke import MISSION_KEYS, SMOKE, error_line
+from same_figures import different_across_compilers
+from smoke import MISSION_KEYS, SMOKE, error_line, without_times
 from untrained import blank
 
 import jaxsense
@@ -33,7 +35,11 @@ def test_run_directory_holds_everything(smoke_run):
 
 
 def test_summary_keeps_its_contract(smoke_run):
-    found = read_summary(smoke_run)  # its types; of most numbers, see `test_same_numbers`
+    found = read_summary(smoke_run)  # its types
+    reference = json.loads((Path(__file__).parent / "smoke_figures.json").read_text("utf-8"))
+    same = without_times(smoke_run)
+    assert not different_across_compilers(same, reference)
+    assert all(set(same["dqn"][name]) == set(block) for name, block in reference["dqn"].items())
     assert (found["preset"], found["seed"]) == ("smoke", 5)
     for block in found["dqn"].values():
         assert block["num_states"] == 384

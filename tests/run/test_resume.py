@@ -1,16 +1,19 @@
-"""Runs that are stopped and go on end with what an uninterrupted run ends with."""
+"""Runs that are stopped or killed and go on end with what an uninterrupted run ends with."""
 
 import contextlib
 import io
 import json
+import os
 import resource
 import shutil
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from smoke import SMOKE, error_line, interrupting, without_times
+from summaries import RESULTS
 
 from jaxsense import train
 from jaxsense.run.rundir import RunDirectory
@@ -120,7 +123,7 @@ def edit(path, field, value):
     (path / "config.json").write_text(json.dumps(content))
 
 
-@pytest.mark.slow  # compiles everything in a new process; see also `test_faults.py`
+@pytest.mark.slow  # compiles everything in a new process
 def test_a_full_disk_is_named_and_nothing_is_lost(smoke_run, cache, tmp_path):
     path = tmp_path / "run"
 
@@ -144,3 +147,43 @@ def test_a_full_disk_is_named_and_nothing_is_lost(smoke_run, cache, tmp_path):
     figures = without_times(path)
     figures.pop("origins", None)  # of a process that sees other devices
     assert figures == without_times(smoke_run)
+
+
+POINTS = {"jmvae_1": 100, "dqn_camera": 40}
+"""Stages in which a run is killed, and after which step."""
+
+
+def killed(path, cache, stage, step):
+    """A run that is killed when it has reported a step, before its end."""
+    command = [sys.executable, "-m", "jaxsense.train", *SMOKE, *cache, "--out", str(path)]
+    environment = {**os.environ, "JAX_NUM_CPU_DEVICES": "2"}  # as tests have them
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stderr=pipe, text=True, env=environment) as process:
+        while not has_reported(path / "metrics.jsonl", stage, step):
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not (path / "summary.json").exists()
+    return path
+
+
+def has_reported(metrics, stage, step):
+    if not metrics.exists():
+        return False
+    *whole, _ = metrics.read_text(encoding="utf-8").split("\n")
+    lines = map(json.loads, whole)
+    return any(line["stage"] == stage and line["step"] >= step for line in lines)
+
+
+@pytest.mark.slow  # a process of its own, and a training that is compiled anew
+@pytest.mark.parametrize("stage", POINTS)
+def test_a_killed_run_resumes_to_the_same_summary(cache, smoke_run, tmp_path, stage):
+    # `smoke_run` has filled the cache, so that most of it is training.
+    path = killed(tmp_path / "run", cache, stage, POINTS[stage])
+    train.main(["--resume", str(path), "--quiet", *cache])
+    resumed, whole = map(without_times, (path, smoke_run))
+    assert all(resumed[block] == whole[block] for block in RESULTS)
+    metrics = (path / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    steps = [(line["stage"], line["step"]) for line in map(json.loads, metrics) if "loss" in line]
+    assert len(set(steps)) == len(steps)
