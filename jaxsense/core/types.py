@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, PyTree, Shaped
 
 T = TypeVar("T")
 
@@ -173,10 +173,6 @@ class Fusion(Protocol):
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        ...
-
-    def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """Most likely class according to a `[D]` belief, int32."""
         ...
 
 

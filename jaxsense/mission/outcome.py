@@ -134,9 +134,9 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       `reason`: `[]` int32, see `reason`.
     """
     config = mission.config
-    shown = jax.vmap(models.fusion.most_likely_class)(state.belief)
     plausible = jax.vmap(models.plausible_classes)(state.belief)
     probabilities = jax.vmap(models.fusion.class_probabilities)(state.belief)
+    shown = jnp.argmax(probabilities, axis=1)
     of_truth = jnp.take_along_axis(probabilities, state.classes[:, None], axis=1)[:, 0]
     is_seen = jnp.any(state.seen, axis=-1)
     is_right = is_seen & (shown == state.classes)

@@ -286,6 +286,7 @@ RETRAINING = DetectorConfig(steps=600, batch=64, learning_rate=3e-4, calibration
 """Settings of `retrain`."""
 
 
+@checks.typed
 def retrain(
     key: Key,
     detector: Classifier,
@@ -309,14 +310,10 @@ def retrain(
       which raises no error, the parameters are NaN if the training or its looks are not finite.
 
     Raises:
-      TypeError: if the detector is an encoder of scans, which learns without labels.
-      ValueError: if windows are not finite, a label is none of the detector's, the training
-        diverges, or `config.calibration` leaves no look to train with, or none to judge by.
+      ValueError: if the detector is an encoder of scans, which learns without labels, windows are
+        not finite, a label is none of the detector's, the training diverges, or
+        `config.calibration` leaves no look to train with, or none to judge by.
     """
-    checks.require_key(key)
-    if not isinstance(detector, Classifier):
-        kind = type(detector).__name__
-        raise TypeError(f"detector is a {kind}; must be a Classifier, which learns from labels")
     shown, labels = jax.tree.map(jnp.asarray, (shown, labels))
     checks.require_shape("windows", shown.windows, (None, detector.window_size))
     reason = "must be finite; leave out what was not recorded"

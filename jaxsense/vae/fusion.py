@@ -59,10 +59,6 @@ class Reader:
         """Probability of each class according to a `[D]` belief."""
         return self.readout.class_probabilities(belief, self.prior)
 
-    def most_likely_class(self, belief: Belief) -> Int[Array, ""]:
-        """Most likely class according to a `[D]` belief, int32."""
-        return jnp.argmax(self.class_probabilities(belief))
-
 
 @pytree
 class InPlace(Reader):

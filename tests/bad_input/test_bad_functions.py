@@ -132,8 +132,7 @@ def log_likelihood(w, weights=(1.0, 1.0), samples=2):
 class Plain:
     """All members of a fusion, but no pytree."""
 
-    accumulates = classes = prior = update = together = None
-    class_probabilities = most_likely_class = None
+    accumulates = classes = prior = update = together = class_probabilities = None
 
 
 def walls(*distances):
@@ -271,7 +270,7 @@ FUNCTIONS = [
     (lambda w: retrain(w, size=7), "windows has the shape (8, 7)"),
     (lambda w: retrain(w, calibration=0.0), "config.calibration = 0.0: must leave"),
     (lambda w: retrain(w, 1e38), "loss of retrained detectors = nan"),
-    (lambda w: retrain(w, detector=3), "detector is a int; must be a Classifier"),
+    (lambda w: retrain(w, detector=3), "detector = 3: must be Classifier"),
     (lambda w: w.filter.update(w.belief, w.seen, w.look, 2), "modality = 2"),
     (
         lambda w: w.filter.update(w.belief, w.seen, THIRDS, 0),
