@@ -71,18 +71,11 @@ def require_shape(name: str, value: object, shape: _Shape) -> None:
     expected = str(tuple(shape)).replace("None", "any").replace("Ellipsis", "...")
     if not isinstance(value, _ARRAYS):
         raise ValueError(f"{name} = {_shown(value)}: must be an array of shape {expected}")
-    if not _has(value, shape):
-        is_batch = ... not in shape and _has(value, (..., *shape))
-        advice = "; use jax.vmap for a batch" if is_batch else ""
-        raise ValueError(f"{name} has the shape {np.shape(value)}: must be {expected}{advice}")
-
-
-def _has(value: object, shape: _Shape) -> bool:
     try:
         chex.assert_shape(value, tuple(shape))
     except AssertionError:
-        return False
-    return True
+        found = f"{name} has the shape {np.shape(value)}"
+        raise ValueError(f"{found}: must be {expected}") from None
 
 
 def require_key(key: object) -> None:

@@ -110,10 +110,6 @@ class Sensor(abc.ABC):
         """Whether a ray's reading depends on the next ray's hit, too; by default not."""
         return False
 
-    def centre(self, bearing: Float[Array, ""]) -> Float[Array, ""]:
-        """Real-valued index of the ray along a bearing, in radians."""
-        return self.rays.centre(bearing)
-
     @property
     def angles(self) -> Float[np.ndarray, "B"]:
         """Angles of the rays in the robot's frame, in radians, in the order of the readings."""
@@ -341,7 +337,7 @@ def scan(
     x, y = directions
     in_world = raycast.turned((x, y), pose[2])
     hits = raycast.cast_along(section, pose[:2], in_world)
-    hits = dataclasses.replace(hits, ray=jax.vmap(sensor.centre)(jnp.arctan2(y, x)))
+    hits = dataclasses.replace(hits, ray=jax.vmap(sensor.rays.centre)(jnp.arctan2(y, x)))
     light = dataclasses.replace(light, point=jnp.append(pose[:2], seconds))
     return sensor.read(key, hits, surfaces(arena, layout), light)
 

@@ -50,7 +50,7 @@ def rays_of(sensor: Sensor, bearing: Float[Array, ""]) -> Float[Array, "2 _"]:
 def _first_ray(sensor: Sensor, bearing: Float[Array, ""]) -> Int[Array, ""]:
     """Index of the first ray that the detector reads around a bearing."""
     span = (sensor.window - 1) * sensor.stride
-    start = jnp.round(sensor.centre(bearing) - span / 2).astype(jnp.int32)
+    start = jnp.round(sensor.rays.centre(bearing) - span / 2).astype(jnp.int32)
     return jnp.clip(start, 0, len(sensor.angles) - 1 - span)
 
 

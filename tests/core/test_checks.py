@@ -142,7 +142,7 @@ def test_arguments_are_of_the_dataclasses_and_protocols_of_their_annotations():
     ("shape", "right", "wrong", "expected"),
     [
         ((2,), (2,), (3,), "x has the shape (3,): must be (2,)"),
-        ((2,), (2,), (4, 2), "(4, 2): must be (2,); use jax.vmap for a batch"),
+        ((2,), (2,), (4, 2), "(4, 2): must be (2,)"),
         ((2, None), (2, 7), (2,), "(2,): must be (2, any)"),
         ((None, 3), (0, 3), (2, 4), "(2, 4): must be (any, 3)"),
         ((3, ...), (3, 1, 4), (), "(): must be (3, ...)"),

@@ -54,7 +54,7 @@ def test_programs_of_a_sensor_give_what_jaxsense_gives(models, loaded, m):
 
     def detect(readings, bearing, distance):
         # The nearest window in the scan, ray by ray.
-        first = round(float(sensor.centre(bearing)) - (sensor.window - 1) * sensor.stride / 2)
+        first = round(float(sensor.rays.centre(bearing)) - (sensor.window - 1) * sensor.stride / 2)
         rays = first + np.arange(sensor.window) * sensor.stride
         window = np.minimum(readings[rays], sensor.window_limit).reshape(-1)
         features = np.asarray(of_window(window, distance))

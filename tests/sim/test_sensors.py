@@ -61,7 +61,7 @@ def view(scans, known_layout):
 def test_a_single_ray_points_ahead():
     one = sensors.lidar(LidarConfig(num_beams=1, window=1))
     np.testing.assert_array_equal(one.angles, [0.0])
-    assert one.centre(jnp.float32(0.0)) == 0.0
+    assert one.rays.centre(jnp.float32(0.0)) == 0.0
     assert one.steps == (0.0, 0.0)
 
 
@@ -85,7 +85,7 @@ def test_centre_is_the_ray_along_a_bearing(noiseless, name, bearing):
     index = np.interp(
         bearing, *zip(*sorted(zip(sensor.angles, range(9999), strict=False)), strict=True)
     )
-    assert float(sensor.centre(jnp.float32(bearing))) == pytest.approx(index, abs=0.02)
+    assert float(sensor.rays.centre(jnp.float32(bearing))) == pytest.approx(index, abs=0.02)
 
 
 def test_noise_has_the_configured_standard_deviation():
