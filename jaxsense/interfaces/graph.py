@@ -3,7 +3,6 @@
 import ast
 import dataclasses
 import hashlib
-from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -30,7 +29,6 @@ class Graph:
       constants: arrays by name, of all graphs.
       sizes: names of the numbers that hold the sizes of named axes.
       names: new ones.
-      known: outputs of operators here and in the graphs around.
       nodes: operators, in their order.
     """
 
@@ -38,7 +36,6 @@ class Graph:
     constants: dict[str, np.ndarray]
     sizes: dict[str, str]
     names: Iterator[str]
-    known: ChainMap[Any, str]
     nodes: list[onnx.NodeProto] = dataclasses.field(default_factory=list)
 
     def constant(self, value: Any) -> str:
@@ -57,12 +54,8 @@ class Graph:
         return outputs
 
     def op(self, operator: str, *inputs: Any, **attributes: Any) -> str:
-        """Applies an operator with one output, on the same inputs once."""
-        given = [x if isinstance(x, str) else self.constant(x) for x in inputs]
-        key = operator, *given, repr(attributes)
-        if key not in self.known:
-            (self.known[key],) = self.ops(operator, 1, *given, **attributes)
-        return self.known[key]
+        """Applies an operator with one output."""
+        return self.ops(operator, 1, *inputs, **attributes)[0]
 
     def cast(self, x: str, dtype: Any) -> str:
         """An array with another dtype."""

@@ -6,7 +6,6 @@ needs no line here, unless it uses a primitive that `_OPERATORS` lacks.
 
 import dataclasses
 import itertools
-from collections import ChainMap
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -175,7 +174,7 @@ def _scan(graph: Graph, e: Equation, *given: str) -> list[str]:
     kinds = [Struct((), np.int64), Struct((), bool), *(v.aval for v in after[:number])]
     inputs = {next(graph.names): kind for kind in kinds}
     step, goes_on, *within = inputs
-    body = dataclasses.replace(graph, known=graph.known.new_child(), nodes=[])
+    body = dataclasses.replace(graph, nodes=[])
     of_step = [body.op("Gather", row, step, axis=0) for row in moving]
     found = [goes_on, *body.run(inner, [*consts, *within, *of_step])]
     outputs = [body.ops("Identity", 1, x)[0] for x in found]
@@ -270,7 +269,7 @@ def program(
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(outputs))
     given = list(itertools.compress([*weights, *inputs], is_read))
     constants = {name: weights[name] for name in given if name in weights}
-    graph = Graph(_OPERATORS, constants, {}, map("x{}".format, itertools.count()), ChainMap())
+    graph = Graph(_OPERATORS, constants, {}, map("x{}".format, itertools.count()))
     for key, array in inputs.items():
         for axis, size in enumerate(array.shape):
             if not isinstance(size, int):
