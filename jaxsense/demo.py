@@ -6,7 +6,6 @@ import webbrowser
 from pathlib import Path
 
 import jax
-import rich.console
 
 from jaxsense import mission
 from jaxsense.config.options import command
@@ -17,7 +16,7 @@ from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import film, page, tables
-from jaxsense.show.terminal import Display, as_text
+from jaxsense.show.terminal import Display
 from jaxsense.summary import make
 from jaxsense.tasks import PRETRAINED, load_pretrained
 
@@ -57,7 +56,6 @@ def main(argv: list[str] | None = None) -> None:
       argv: the command line without the program; by default the process's own.
     """
     arguments = cli.parse(PROGRAM, Arguments, argv)
-    console = rich.console.Console()
     with cli.ending(PROGRAM):
         devices.start(1)
         config, models = load_pretrained(arguments.preset)
@@ -68,7 +66,7 @@ def main(argv: list[str] | None = None) -> None:
         kept = cli.keep_programs(PROGRAM, arguments.cache, config)
         # Before a minute of work.
         with rundir.begun(arguments.out, f"demo-{arguments.preset}") as place:
-            with Display(console) as display, Compiler(Monitor(display.show), kept) as compiler:
+            with Display() as display, Compiler(Monitor(display.show), kept) as compiler:
                 player = missions.Player(scenario, compiler, len(played))
                 found = player.play(jax.random.key(arguments.seed), models, played, episodes=1)
             recordings = {f"{name} policy": each for name, each in found.recordings.items()}
@@ -87,7 +85,7 @@ def main(argv: list[str] | None = None) -> None:
                 table=table,
             )
             files.write(path, text)
-    say(as_text(console, table))
+    say(str(table))
     say(f"This is one mission of many; averages: README, {_AVERAGES}.")
     say(f"The page is {path}.")
     say(f"Next: {command('jaxsense tasks')}")

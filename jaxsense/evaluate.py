@@ -5,8 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
-import rich.console
-import rich.table
 
 from jaxsense import mission
 from jaxsense.config import Config, ConfigError
@@ -21,7 +19,7 @@ from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import drawing, film, page, plots, tables
-from jaxsense.show.terminal import Display, as_text
+from jaxsense.show.terminal import Display
 from jaxsense.summary import blocks, compare, make
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS, read_evaluations, read_summary
@@ -83,8 +81,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
       policies: custom policies by name, to play in addition to `dqn.POLICIES`.
     """
     arguments = cli.parse(PROGRAM, Arguments, argv)
-    console = rich.console.Console()
-    display = Display(console)
+    display = Display()
     with cli.ending(PROGRAM):
         arguments = dataclasses.replace(arguments, run=rundir.newest(arguments.run))
         workers = devices.start(arguments.devices)
@@ -113,7 +110,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
             files.write(path, text)
             written.append(f"The first mission of {name} is in {path}.")
         written.append(_write(arguments, trained, config, block))
-    _print(console, block, arguments.episodes)
+    _print(block, arguments.episodes)
     timing = monitor.timing()
     seconds = timing["stages"]["mission"]["run_s"]
     compiling = timing["total_s"] - seconds
@@ -200,12 +197,12 @@ def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission
     return {arguments.policy: cases[arguments.policy]}
 
 
-def _print(console: rich.console.Console, missions: blocks.Missions, episodes: int) -> None:
+def _print(missions: blocks.Missions, episodes: int) -> None:
     """Prints the metrics of all cases."""
     caption = f"{episodes} missions of each policy, in the same arenas"
     for table in (tables.missions(missions, caption), tables.failures(missions)):
         if table.rows:
-            say(as_text(console, table))
+            say(str(table))
     if verdict := compare.verdict(missions):
         say(verdict)
 

@@ -1,14 +1,12 @@
 """`jaxsense tasks`: the frozen tasks, and what known policies reach in them."""
 
 import numpy as np
-import rich.console
 
 from jaxsense import tasks
 from jaxsense.config.section import Checked
 from jaxsense.run import cli, devices, output
 from jaxsense.run.output import tell
 from jaxsense.show.tables import Table
-from jaxsense.show.terminal import as_text
 from jaxsense.tasks import Task
 from jaxsense.tasks.registry import TASKS, agents
 from jaxsense.tasks.score import estimate
@@ -33,7 +31,7 @@ def main(argv: list[str] | None = None) -> None:
     with cli.ending(PROGRAM):
         devices.start(1)
     found = [tasks.make(name, agent) for name in tasks.registered() for agent in agents(name)]
-    tell(as_text(rich.console.Console(), _table(found)))
+    tell(str(_table(found)))
     for name, about in TASKS.items():
         tell(f"{name}: {about}.")
     tell(

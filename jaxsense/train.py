@@ -16,8 +16,6 @@ from typing import NoReturn
 
 import jax
 import numpy as np
-import rich.console
-import rich.table
 
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import command, given
@@ -32,7 +30,7 @@ from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import tables, terminal
-from jaxsense.show.terminal import Display, as_text
+from jaxsense.show.terminal import Display
 from jaxsense.summary import blocks, compare
 from jaxsense.summary.blocks import Header, Origin
 from jaxsense.summary.read import read_origins, read_summary
@@ -99,7 +97,6 @@ def main(
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
     if is_helper := bool(arguments.process_index):
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
-    console = rich.console.Console(quiet=arguments.quiet)
     with cli.ending(PROGRAM, "; earlier checkpoints are intact"):
         # Before joining, so that no process waits for a first one that refuses its options.
         with _open(arguments) as run:
@@ -110,12 +107,12 @@ def main(
                 arguments.process_index,
                 quiet=arguments.quiet,
             )
-            _train(arguments, run, console, policies)
+            _train(arguments, run, policies)
         devices.leave()
     if is_helper:
         return
     if not arguments.quiet:
-        _print_summary(console, run)
+        _print_summary(run)
     # A quiet run prints only these two lines.
     first = next(path for path in run.seeds.values() if (path / "report.html").exists())
     say(f"Results are in {run.path}. Start with {run.path / 'report.html'}.")
@@ -182,12 +179,7 @@ def _open(arguments: Arguments) -> Iterator[RunDirectory]:
         yield stack.enter_context(opened)
 
 
-def _train(
-    arguments: Arguments,
-    run: RunDirectory,
-    console: rich.console.Console,
-    policies: OwnPolicies | None,
-) -> None:
+def _train(arguments: Arguments, run: RunDirectory, policies: OwnPolicies | None) -> None:
     """Trains the seeds that are left with the same programs, and sums all up."""
     config, failed, monitor = run.settings.config, dict[int, str](), Monitor(warn=_warn)
     workers = devices.start(arguments.devices)
@@ -205,7 +197,7 @@ def _train(
             programs = Programs(config, compiler, workers, len(left), policies)
             for seed, path in left:
                 with run.of_seed(seed, path) as of_seed:
-                    if reason := _train_one(arguments, of_seed, programs, console):
+                    if reason := _train_one(arguments, of_seed, programs):
                         failed[seed] = reason
                 monitor.restart()
     except Stopped:
@@ -229,9 +221,7 @@ def _end_stopped(run: RunDirectory) -> NoReturn:
     sys.exit(output.INTERRUPTED)
 
 
-def _train_one(
-    arguments: Arguments, run: RunDirectory, programs: Programs, console: rich.console.Console
-) -> str | None:
+def _train_one(arguments: Arguments, run: RunDirectory, programs: Programs) -> str | None:
     """Trains one seed and writes its run; returns why it failed, if it did."""
     records = [run.append_metrics]
     if arguments.tensorboard:
@@ -239,7 +229,7 @@ def _train_one(
     origins = run.sign()
     if several := compare.several_origins(origins):
         _warn(f"{run.path}: {several}")
-    with Display(console, records, quiet=arguments.quiet) as display:
+    with Display(records, arguments.quiet) as display:
         programs.monitor.begin(display.show)
         try:
             results, pictures = _results(run, programs)
@@ -307,7 +297,7 @@ def _header(run: RunDirectory, origins: list[Origin]) -> Header:
     return {**found, "origins": different} if compare.differences_of(different) else found
 
 
-def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
+def _print_summary(run: RunDirectory) -> None:
     """Prints the main metrics; of several seeds, mean and 95% interval."""
     found, settings = read_summary(run.path), run.settings
     which = f"seed {settings.seed}"
@@ -316,7 +306,7 @@ def _print_summary(console: rich.console.Console, run: RunDirectory) -> None:
     say(f"{settings.preset} preset, {which}, {found['timing']['total_s']:.0f} s in total")
     missions = tables.missions(found["mission"], "Missions")
     for table in (tables.detectors(found), tables.agents(found), missions):
-        say(as_text(console, table))
+        say(str(table))
     if verdict := compare.verdict(found["mission"]):
         say(verdict)
     for remark in compare.remarks(found):

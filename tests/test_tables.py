@@ -46,6 +46,16 @@ def test_figures_stand_in_tables():
     assert tables.times(SUMMARY, SUMMARY["timing"])[0].rows == [("jmvae", ["1.50", "4.50"])]
 
 
+def test_columns_are_aligned():
+    table = tables.Table("Both", ["a", "long"], [("one", ["1.5", "2"]), ("second", ["10", "[b]"])])
+    assert str(table).splitlines() == [
+        "Both",
+        "          a  long",
+        "one     1.5     2",
+        "second   10   [b]",
+    ]
+
+
 def show(display):
     with display:
         display.show("dqn", 0, 0, {})
@@ -56,7 +66,8 @@ def show(display):
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_terminal_shows_count_time_left_and_metrics_at_any_width(width):
     text = io.StringIO()
-    show(Display(rich.console.Console(file=text, force_terminal=True, width=width)))
+    console = rich.console.Console(file=text, force_terminal=True, width=width)
+    show(Display(console=console))
     shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue())
     last = [line for line in shown.splitlines() if line.startswith("dqn_camera")][-1]
     assert re.search(r"200/800 +\S+ +loss 0.25", last)
@@ -66,7 +77,7 @@ def test_a_terminal_shows_count_time_left_and_metrics_at_any_width(width):
 @pytest.mark.parametrize("is_quiet", [False, True])
 def test_without_a_terminal_there_are_plain_lines_now_and_then(capsys, is_quiet):
     records, console = [], rich.console.Console(file=io.StringIO())
-    show(Display(console, [lambda **figures: records.append(figures)], is_quiet))
+    show(Display([lambda **figures: records.append(figures)], is_quiet, console))
     lines = capsys.readouterr().out.splitlines()
     expected = ["dqn: compiling", "dqn_camera: 100 of 800  loss 0.5  reward 1"]
     told = [re.sub(r"^ *[\d.]+ s  ", "", line) for line in lines]

@@ -41,6 +41,13 @@ class Table:
     rows: list[tuple[str, list[str]]]
     meanings: dict[str, str] = dataclasses.field(default_factory=dict)
 
+    def __str__(self) -> str:
+        """As lines of text, with aligned columns."""
+        lines = [["", *self.columns], *([name, *texts] for name, texts in self.rows)]
+        first, *widths = (max(map(len, column)) for column in zip(*lines, strict=True))
+        rows = [[name.ljust(first), *map(str.rjust, texts, widths)] for name, *texts in lines]
+        return "\n".join([self.caption, *map("  ".join, rows), ""])
+
 
 def _table(
     caption: str, blocks: Mapping[str, Mapping[str, object]], metrics: Iterable[Metric]

@@ -1,23 +1,17 @@
 """Shows the progress of a program: on a terminal, as lines, or as event files for TensorBoard."""
 
-import io
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import rich.box
 import rich.console
-import rich.table
-import rich.text
 from rich import progress
 from rich.table import Column
 
 from jaxsense.core import inside
 from jaxsense.run.output import say
-from jaxsense.show.tables import Table
 
 _LINE_PERIOD = 5.0  # s
-_ENDLESS = 10_000  # columns of a file or a pipe, where nothing is cut
 
 
 class Display:
@@ -25,12 +19,13 @@ class Display:
 
     def __init__(
         self,
-        console: rich.console.Console,
         records: Sequence[Callable[..., None]] = (),
         quiet: bool = False,
+        console: rich.console.Console | None = None,
     ):
         """Shows progress on a console; `records` receive the metrics of every report."""
-        self._console, self._records, self._quiet = console, records, quiet
+        console = console or rich.console.Console()
+        self._records, self._quiet, self._is_live = records, quiet, console.is_terminal
         self._tasks: dict[str, progress.TaskID] = {}
         self._last: dict[str, float] = {}
         self._begin = time.perf_counter()
@@ -41,8 +36,8 @@ class Display:
             progress.TimeRemainingColumn(),
             progress.TextColumn("{task.fields[metrics]}"),
         )
-        is_live = console.is_terminal and not quiet
-        self._progress = progress.Progress(*columns, console=console, disable=not is_live)
+        is_shown = self._is_live and not quiet
+        self._progress = progress.Progress(*columns, console=console, disable=not is_shown)
 
     def __enter__(self) -> "Display":
         self._progress.start()
@@ -75,7 +70,7 @@ class Display:
             # Stages without a total never report that they end.
             is_waiting = other.total is None and other.description != stage
             self._progress.update(other.id, visible=not is_waiting)
-        if not self._console.is_terminal:
+        if not self._is_live:
             self._show_line(stage, done, total, text)
 
     def _show_line(self, stage: str, done: int, total: int, text: str) -> None:
@@ -89,23 +84,6 @@ class Display:
         state = f"{done} of {total}" if total else "compiling"
         state += f", {left:.0f} s left" if left else ""
         say(f"{now - self._begin:6.1f} s  {stage}: {state}  {text}".rstrip())
-
-
-def as_text(console: rich.console.Console, table: Table) -> str:
-    """A table as a console shows it; markup in cells is not interpreted."""
-    drawn = rich.table.Table("", box=rich.box.SIMPLE, pad_edge=False, title_justify="left")
-    drawn.title = rich.text.Text(table.caption)
-    for name in table.columns:
-        drawn.add_column(rich.text.Text(name), justify="right")
-    for name, values in table.rows:
-        drawn.add_row(*map(rich.text.Text, (name, *values)))
-    if not console.is_terminal:
-        # Even the nothing that it writes while it is captured fails on a full disk.
-        nowhere = io.TextIOWrapper(io.BytesIO(), getattr(console.file, "encoding", None))
-        console = rich.console.Console(file=nowhere, width=_ENDLESS)
-    with console.capture() as captured:
-        console.print(drawn)
-    return captured.get().removesuffix("\n")
 
 
 def tensorboard(path: Path) -> Callable[..., None]:
