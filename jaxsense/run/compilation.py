@@ -234,16 +234,16 @@ class Program:
             lowered = self._lower(function, args, mesh, whole)
 
         def compile_lowered() -> None:
-            if self._compiled.done():  # failed or released
+            if self._compiled.done():  # released
                 return
             try:
                 with self.measure("compile_s"):
                     supported = devices.compiler_options(**options)
                     compiled = lowered.compile(compiler_options=supported)
             except Exception as error:
-                self.fail(error)
+                self._monitor.fail(error)
                 return
-            with contextlib.suppress(InvalidStateError):  # `fail` was called before
+            with contextlib.suppress(InvalidStateError):  # released
                 self._compiled.set_result(compiled)
             devices.give_back_freed()
 
@@ -275,11 +275,6 @@ class Program:
     def measure(self, kind: Literal["compile_s", "run_s"]) -> AbstractContextManager[None]:
         """Adds the seconds of a block to those of the stage."""
         return self._monitor.measure(kind, self._stage)
-
-    def fail(self, error: BaseException) -> None:
-        """Makes all calls raise an error, unless the program is compiled already."""
-        with contextlib.suppress(InvalidStateError):
-            self._compiled.set_exception(error)
 
     def release(self) -> None:
         """Lets go of the compiled program, which holds tens of MiB; nobody may call it again."""
@@ -317,6 +312,7 @@ class RowProgram:
 
     def __init__(self, program: Program, workers: Workers):
         self._program, self._workers = program, workers
+        self._results = Future[PyTree]()  # their shapes
 
     def compile(
         self, function: Function, *args: PyTree, whole: int
@@ -331,13 +327,14 @@ class RowProgram:
         self._rows = [np.arange(i * size, (i + 1) * size) % number for i in range(calls)]
         some = jax.tree.map(lambda x: x.update(shape=(size, *x.shape[1:])), shapes[whole:])
         results = self._program.compile(function, *shapes[:whole], *some, mesh=mesh, whole=whole)
-        self._results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
-        return self._results
+        results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
+        self._results.set_result(results)
+        return results
 
     def __call__(self, *args: PyTree) -> PyTree[np.ndarray]:
         """Runs the program for all rows."""
         self._program.wait()
-        results = jax.tree.map(devices.empty, self._results)
+        results = jax.tree.map(devices.empty, self._results.result())
 
         def run(rows: np.ndarray) -> None:
             some = jax.tree.map(lambda x: x[rows], args[self._whole :])

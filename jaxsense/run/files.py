@@ -29,7 +29,7 @@ UNFINISHED = "unfinished"
 """The directory of unfinished trainings in that of checkpoints."""
 _REST = 2**20  # bytes of a checkpoint that are not numbers
 _DIGEST = hashlib.sha256().digest_size
-_PARTIAL_NAME = re.compile(r"\.(.+)\.[0-9a-f]{16}\.unfinished")
+_PARTIAL_NAME = re.compile(r"\..+\.[0-9a-f]{16}\.unfinished")
 
 
 class WriteError(OSError):
@@ -100,18 +100,12 @@ def append(path: Path, line: str) -> None:
         file.write(line + "\n")
 
 
-def is_unfinished(path: Path, name: str | None = None) -> bool:
-    """Whether a killed `write` of the file `name`, or of any, left this partial file."""
-    found = _PARTIAL_NAME.fullmatch(path.name)
-    is_ours = found is not None and name in (None, found[1])
-    return is_ours and path.is_file() and not path.is_symlink()
-
-
 def remove_unfinished(directory: Path) -> None:
     """Removes the partial files of a killed `write` from a directory."""
-    for path in filter(is_unfinished, directory.iterdir()):
-        with contextlib.suppress(OSError):
-            path.unlink()
+    for path in directory.iterdir():
+        if _PARTIAL_NAME.fullmatch(path.name) and path.is_file() and not path.is_symlink():
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 @contextlib.contextmanager

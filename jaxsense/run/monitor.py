@@ -48,15 +48,16 @@ class Monitor:
           listener: receives progress.
           warn: receives a line about a failure that does not end the run.
         """
-        self.warn = warn
+        self.warn, self._failure = warn, None
         self._lock, self._stop = threading.Lock(), threading.Event()
         self.begin(listener)
         self.restart()
 
     def begin(self, listener: Listener) -> None:
-        """Begins another run: forgets a failure and replaces the listener."""
-        self._failure: BaseException | None = None
+        """Begins another run with the same programs, also if a stage of the last one failed."""
         self._listener = listener
+        if isinstance(self._failure, StageError):
+            self._failure = None
 
     def restart(self) -> None:
         """Starts the stopwatch again for another run."""
@@ -82,7 +83,7 @@ class Monitor:
         self._stop.set()
 
     def fail(self, failure: BaseException) -> None:
-        """Stops the stages that run concurrently with a failed one."""
+        """Stops everything that runs or waits beside what has failed."""
         self._failure = failure
 
     @property

@@ -117,7 +117,8 @@ def play(
     Raises:
       StageError, Stopped: see `missions.Player.play`.
     """
-    player, settings = programs.player.result(), programs.config.mission
+    player = programs.monitor.wait_for(programs.player)
+    settings = programs.config.mission
     cases = mission.cases(programs.config, player.mission.policies)
     of_run = {name: cases[name] for name in settings.policies}
     played = player.play(stages.mission_key(key), learned.models, of_run, settings.episodes)
@@ -231,7 +232,7 @@ class _Training:
                 raise
             self.programs.monitor.warn(f"{error}: left out")
             self.curves[stage.name] = self._no_curves(stage)
-            return _failed(programs.shapes.result().output)
+            return _failed(self.programs.shapes(stage).output)
         return programs.finish(config, state, inputs)
 
     def _run_chunks(
@@ -299,12 +300,12 @@ class _Training:
             if curves is None:
                 return None
             self.curves[stage.name] = curves
-        output = self.programs.of(stage).shapes.result().output
+        output = self.programs.shapes(stage).output
         return self.checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a training that has not begun, or has failed."""
-        lengths = dict.fromkeys(self.programs.of(stage).shapes.result().metrics, stage.steps)
+        lengths = dict.fromkeys(self.programs.shapes(stage).metrics, stage.steps)
         lengths["seconds"] = stage.chunks
         return {name: np.full(length, np.nan, np.float32) for name, length in lengths.items()}
 

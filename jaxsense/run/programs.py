@@ -7,8 +7,7 @@ compiled programs already run. Shapes come from tracing: a stage's outputs are l
 import threading
 from collections import Counter
 from collections.abc import Mapping
-from concurrent.futures import Future, InvalidStateError
-from contextlib import suppress
+from concurrent.futures import Future
 from typing import NamedTuple
 
 import jax
@@ -50,13 +49,6 @@ class StagePrograms:
             self.begin = RowProgram(self.begin, workers)
         self.shapes: Future[Shapes] = Future()
 
-    def fail(self, error: BaseException) -> None:
-        """Raises an error wherever the programs are awaited, now or later."""
-        for program in self._all:
-            program.fail(error)
-        with suppress(InvalidStateError):
-            self.shapes.set_exception(error)
-
     def release(self) -> None:
         """Lets go of the compiled programs."""
         for program in self._all:
@@ -95,6 +87,10 @@ class Programs:
         """The programs of a stage."""
         return self._of[stage.program]
 
+    def shapes(self, stage: Stage) -> Shapes:
+        """Shapes of a stage, once it is traced."""
+        return self.monitor.wait_for(self.of(stage).shapes)
+
     def used(self, stage: Stage) -> None:
         """Notes that a training is done with a stage, and lets go of programs that none needs."""
         with self._lock:
@@ -103,7 +99,7 @@ class Programs:
                 self.of(stage).release()
 
     def _trace(self) -> None:
-        """Traces all programs; an error reaches whoever waits for one."""
+        """Traces all programs."""
         # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
         # free to compile, and everything waits for tracing.
         left = [stage.name for stage in self.stages[_BEFORE_MISSIONS:]] if _on_cpu() else []
@@ -118,10 +114,7 @@ class Programs:
             if not left:
                 self._compile_missions()
         except BaseException as error:
-            for each in self._of.values():
-                each.fail(error)
-            with suppress(InvalidStateError):
-                self.player.set_exception(error)
+            self.monitor.fail(error)
 
     def _compile_missions(self) -> None:
         config = self.config

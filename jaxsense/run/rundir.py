@@ -65,7 +65,6 @@ class RunDirectory:
         with begun(path, settings.preset) as place, _locked(place, "out"):
             run = cls(place, settings)
             with _writable(place, "out"):
-                run._remove_partial()
                 # There is none, unless another process has been faster.
                 write_json(place / "config.json", as_json(settings), is_new=True)
             try:
@@ -184,11 +183,10 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
         is_new = path is None or not path.exists()
         path = path or dated(name)
         path.mkdir(parents=True, exist_ok=True)
-        for each in path.iterdir():
-            # A process that was killed at once leaves these.
-            if each.name != ".lock" and not files.is_unfinished(each, "config.json"):
-                reason = "is not empty; must be a new or empty directory"
-                raise ConfigError("out", str(path), reason)
+        # A process that was killed at once leaves the lock.
+        if any(each.name != ".lock" for each in path.iterdir()):
+            reason = "is not empty; must be a new or empty directory"
+            raise ConfigError("out", str(path), reason)
     try:
         yield path
     finally:

@@ -4,7 +4,6 @@ import gc
 import tempfile
 import time
 import weakref
-from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -257,9 +256,8 @@ def go_on(path, chunks, run, monitor=None):
         return state + 1, {"chunk": [chunk], "seconds": [1.0]}
 
     stage = Stage("jmvae", lambda key, config: (), steps=chunks, chunks=chunks)
-    (shapes := Future[Shapes]()).set_result(Shapes(None, ("chunk",)))
-    of_stage, monitor = SimpleNamespace(shapes=shapes), monitor or Monitor()
-    programs = SimpleNamespace(monitor=monitor, of=lambda stage: of_stage)
+    shapes = lambda stage: Shapes(None, ("chunk",))  # noqa: E731
+    programs = SimpleNamespace(monitor=monitor or Monitor(), shapes=shapes)
     training = pipeline._Training(KEY, programs, Checkpoints(path))
     return training._run_chunks(stage, np.float32(0), counted), training.curves["jmvae"]
 
