@@ -1,7 +1,6 @@
 """The plots of a run say what is in them, in colours that all can tell apart."""
 
-from dataclasses import replace
-
+import jax
 import numpy as np
 import pytest
 
@@ -9,12 +8,9 @@ from jaxsense.config import PRESETS
 from jaxsense.core.types import Belief
 from jaxsense.show import colours, plots
 from jaxsense.sim import sensors
-from jaxsense.training.measures import reliability
+from jaxsense.training.measures import diagram
 
 CONFIG = PRESETS["smoke"]
-LIDAR = replace(
-    CONFIG, modalities=("lidar",), jmvae=replace(CONFIG.jmvae, reconstruction_weights=(1.0,))
-)
 CURVES = {"reward": np.arange(40.0), "evaluation": np.full(40, np.nan)}
 CURVES["evaluation"][[9, 19, 29, 39]] = [1.0, 2.0, 3.0, 4.0]
 AGENT = {"return": 4.0, "optimal": 4.5, "naive": 3.0, "random": -1.0}
@@ -51,10 +47,10 @@ def test_a_detector_that_is_calibrated_lies_on_the_diagonal():
     # Of ten looks at a class, nine say so with .9, and one says the opposite. A bin of fewer than
     # twenty looks, six with .8, is left out.
     right, wrong, rare = [0.9, 0.1], [0.1, 0.9], [0.8, 0.2]
-    looks = np.array([[right] * 9 + [wrong], [right] * 9 + [wrong], [wrong] * 9 + [right]])
-    looks = np.concatenate([looks, np.tile(rare, (3, 2, 1))], axis=1)
+    looks = ([right] * 9 + [wrong]) * 2 + [wrong] * 9 + [right] + [rare] * 6
+    found = jax.tree.map(np.asarray, diagram(np.array(looks), np.repeat([0, 1, 0], [20, 10, 6])))
     belief = {"looks": [1, 2], "nll": [0.5, 0.2], "bayes_nll": [0.4, 0.1]}
-    figure = plots.calibration(CONFIG, reliability(LIDAR, (looks,)), belief)
+    figure = plots.calibration(CONFIG, {"lidar": found}, belief)
     detectors, beliefs = map(lines, figure.axes)
     points = np.array(detectors["lidar"].get_data())
     np.testing.assert_allclose(points[np.isfinite(points)], [0.9, 0.9], rtol=1e-6)

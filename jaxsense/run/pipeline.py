@@ -22,7 +22,6 @@ from jaxsense.sim import sensors
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, learners
-from jaxsense.training.measures import reliability
 from jaxsense.training.stage import Output, Progress, Stage
 
 Curves = dict[str, np.ndarray]
@@ -49,7 +48,7 @@ class Learned:
     Attributes:
       models: the trained networks.
       windows: for each modality `[C, window, channels]` one look at each class, from left to right.
-      reliability: for each modality, see `training.measures.reliability`.
+      reliability: for each modality the points of its diagram.
       posteriors: `[C, S', D]` beliefs of these, `joint` and for each modality.
       rewards: for each Q-network, named by its modality or `team`, the `[epochs]` mean total reward
         of the episodes that ended, `reward`, and of the learned policy of a robot that is alone on
@@ -70,6 +69,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
     config, trained = programs.config, train(key, programs, checkpoints)
     outputs, curves = trained.outputs, trained.curves
     posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
+    measured, reliability = jax.tree.map(np.asarray, outputs["detector_metrics"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
     beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
     is_sound = compare.unsound(beliefs) is None
@@ -89,7 +89,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
             sensor.name: sensor.from_left(windows[:, 0])
             for sensor, windows in zip(sensors.make(config), detections.windows, strict=True)
         },
-        reliability=reliability(config, detections.held_out),
+        reliability=reliability,
         posteriors=posteriors,
         rewards={
             network.removeprefix("dqn_"): {
@@ -98,7 +98,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
             for network in learners(config)
         },
         results={
-            "detectors": make.plain(outputs["detector_metrics"]),
+            "detectors": make.plain(measured),
             "jmvae": make.jmvae(latent | grouped),
             "belief": beliefs,
             "dqn": {

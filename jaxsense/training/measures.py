@@ -25,34 +25,24 @@ _ACTIVE_VARIANCE = 0.01
 
 def detector_metrics(
     key: Key, config: Config, *, detections: Detections
-) -> dict[str, dict[str, Float[Array, ""]]]:
-    """Accuracy, expected calibration error `ece` and `nll` in nats, of held-out scans."""
+) -> tuple[dict[str, dict[str, Float[Array, ""]]], dict[str, Reliability]]:
+    """Accuracy, expected calibration error `ece` and `nll` in nats, of held-out scans.
+
+    Returns:
+      These of each modality, and the points of its reliability diagram.
+    """
     del key
-    found = {}
-    for name, (probabilities, labels) in _with_labels(config, detections.held_out).items():
+    found, diagrams = {}, {}
+    for name, looks in zip(config.modalities, detections.held_out, strict=True):
+        labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
+        probabilities = looks.reshape(-1, looks.shape[-1])
+        diagrams[name] = diagram(probabilities, labels)
         found[name] = {
             "accuracy": jnp.mean(probabilities.argmax(axis=-1) == labels),
-            "ece": calibration_error(probabilities, labels),
+            "ece": calibration_error(diagrams[name]),
             "nll": negative_log_likelihood(probabilities, labels),
         }
-    return found
-
-
-def reliability(config: Config, held_out: Samples) -> dict[str, Reliability]:
-    """Reliability diagrams of all detectors, from `[C, S, D_m]` features of held-out looks."""
-    return {
-        name: jax.tree.map(np.asarray, diagram(*given))
-        for name, given in _with_labels(config, held_out).items()
-    }
-
-
-def _with_labels(config: Config, held_out: Samples) -> dict[str, tuple[jax.Array, jax.Array]]:
-    """For each modality `[S, L]` probabilities of the labels, and `[S]` labels."""
-    found = {}
-    for name, looks in zip(config.modalities, held_out, strict=True):
-        labels = jnp.repeat(jnp.array(config.label_of_class(name)), looks.shape[1])
-        found[name] = jnp.asarray(looks).reshape(-1, looks.shape[-1]), labels
-    return found
+    return found, diagrams
 
 
 def negative_log_likelihood(
@@ -64,16 +54,12 @@ def negative_log_likelihood(
     return -jnp.mean(jnp.log(jnp.maximum(right, 1e-12)))
 
 
-def calibration_error(
-    probabilities: Float[Array, "S L"], labels: Int[Array, " S"]
-) -> Float[Array, ""]:
+def calibration_error(found: Reliability) -> Float[Array, ""]:
     """Expected calibration error of the most likely labels (Guo et al. 2017, Sec. 2).
 
-    The difference between mean confidence and accuracy in a bin of the `diagram`, averaged over
-    all looks.
+    The difference between mean confidence and accuracy in a bin, averaged over all looks.
     """
-    found = diagram(probabilities, labels)
-    share = found.looks / len(labels)
+    share = found.looks / jnp.sum(found.looks)
     return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
 
 

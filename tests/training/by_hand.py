@@ -1,7 +1,5 @@
 """A JMVAE whose weights are set by hand, and detections that it knows."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -71,9 +69,8 @@ CLASS_MEANS = jnp.array([[10.0, 0, 0], [0, 0, 0], [0, 10, 0]])
 
 
 def detections(bank=(), held_out=()):
-    """Detections that episodes do not start from."""
-    nothing: Any = ()
-    return Detections(bank, held_out, nothing, nothing)
+    """Detections of which no window is stored."""
+    return Detections(bank, held_out, windows=())
 
 
 def in_place(means=CLASS_MEANS):

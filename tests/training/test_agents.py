@@ -2,12 +2,12 @@
 
 import dataclasses
 from types import SimpleNamespace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from by_hand import detections
 from tiny import KEY, TINY, inputs_of, stage_of
 from untrained import untrained
 
@@ -15,15 +15,8 @@ from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief
 from jaxsense.dqn import training as dqn
 from jaxsense.training import comparison
-from jaxsense.training.detections import Detections
 
 BANK = dataclasses.replace(TINY, dqn=dataclasses.replace(TINY.dqn, observe="bank"))
-
-
-def detections_of(bank, held_out: Any = (), starts: Any = ()) -> Detections:
-    """Detections of given features."""
-    nothing: Any = ()
-    return Detections(bank, held_out, starts, nothing)
 
 
 def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward():
@@ -37,9 +30,7 @@ def test_values_of_looks_are_of_detections_for_training_and_of_the_mdps_reward()
     mean = jnp.array([[0.0], [3.0], [3.0 + 12**0.5]])
     classes = Belief(mean, jnp.ones((3, 1)))
     stage = stage_of("look_values", config)
-    camera, lidar = jax.jit(stage.begin)(
-        KEY, config, classes=classes, detections=detections_of(bank)
-    )
+    camera, lidar = jax.jit(stage.begin)(KEY, config, classes=classes, detections=detections(bank))
     even = jnp.full(3, 1 / 3)
     # ln 3 before; nothing after a green one, and ln 2 after each of two red ones.
     expected = [np.log(3) - np.log(2) * 2 / 3 - 0.125, -0.125]
@@ -76,12 +67,12 @@ def test_an_agent_learns_on_the_bank_and_its_evaluation_is_on_held_out_looks(mon
 
     monkeypatch.setattr(dqn, "train_chunk", train_chunk)
     monkeypatch.setattr(comparison, "evaluation", evaluation)
-    stage, starts = stage_of(name, BANK), SimpleNamespace(classes=jnp.zeros((0, 3)))
+    stage = stage_of(name, BANK)
     found = {
         "starts": ("to learn from", "to evaluate"),
         "novelty": models.novelty,
         "fusion": models.fusion,
-        "detections": detections_of(bank, held_out, starts),
+        "detections": detections(bank, held_out),
         **dict(zip(("detector_camera", "detector_lidar"), models.detectors, strict=True)),
     }
     inputs = inputs_of(name, BANK, found)

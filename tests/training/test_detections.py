@@ -1,7 +1,6 @@
 """What detectors are trained and calibrated on."""
 
 import dataclasses
-from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,10 +18,9 @@ NOTHING = Looks(100 + jnp.arange(16.0).reshape(8, 2), jnp.ones(8))
 def given_to_detectors(windows, labels):
     """Inputs of a detector's stage, of one PoI a scene."""
     classes = 2 * labels[:, None]  # a green cylinder, or a red cube
-    number, scenes = len(labels), cast("Any", jnp.arange(len(labels)))
-    of_both, distances = (windows[:, None],) * 2, jnp.ones((number, 2, 1))
-    survey = Survey(classes, scenes, of_both, distances)
-    others = Survey(classes, scenes, tuple(200 + x for x in of_both), distances)
+    of_both, distances = (windows[:, None],) * 2, jnp.ones((len(labels), 2, 1))
+    survey = Survey(classes, of_both, distances)
+    others = Survey(classes, tuple(200 + x for x in of_both), distances)
     return {"surveys": Surveys(survey, others, others, others), "examples": (NOTHING, NOTHING)}
 
 

@@ -1,23 +1,14 @@
 """Restarts of the JMVAE, the best of them, and beliefs of classes."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from by_hand import detections
 from tiny import KEY, TINY, stage_of
 
 from jaxsense.core.types import Belief
 from jaxsense.training import jmvaes
-from jaxsense.training.detections import Detections
-
-
-def bank_of(bank) -> Detections:
-    """Detections for training, without any to measure on."""
-    nothing: Any = ()
-    return Detections(bank, nothing, nothing, nothing)
-
 
 # The camera tells class 0 from the others, the LiDAR class 2. Classes in the same place cannot be
 # read from a belief.
@@ -33,7 +24,7 @@ def kept(losses, classes):
     camera = np.float32([[0.1, 0.9], [0.9, 0.1], [0.9, 0.1]])[:, None]
     given = {
         "restarts": restarts,
-        "detections": bank_of((jnp.asarray(camera), jnp.asarray(camera[::-1]))),
+        "detections": detections((jnp.asarray(camera), jnp.asarray(camera[::-1]))),
     }
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jmvaes, "class_beliefs", of_restart)

@@ -158,7 +158,8 @@ def test_calibration_error_and_likelihood_by_hand():
     probabilities = jnp.array([[0.95, 0.05], [0.0, 1.0], [0.65, 0.35]])
     labels = jnp.array([0, 0, 0])
     expected = (abs(0.95 + 1.0 - 1) + abs(0.65 - 1)) / 3
-    assert measures.calibration_error(probabilities, labels) == pytest.approx(expected, abs=1e-6)
+    error = measures.calibration_error(measures.diagram(probabilities, labels))
+    assert error == pytest.approx(expected, abs=1e-6)
     found = measures.negative_log_likelihood(probabilities[::2], labels[::2])
     assert found == pytest.approx(-(np.log(0.95) + np.log(0.65)) / 2, rel=1e-5)
     # A label of probability zero costs no more than a finite number.
