@@ -49,6 +49,6 @@ def lowered(config):
         with Compiler(Monitor()) as compiler:
             made = Programs(config, compiler)
             for stage in made.stages:
-                made.of(stage).shapes.result()
+                made.of(stage)
             made.player.result()
     return found

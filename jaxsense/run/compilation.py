@@ -12,7 +12,7 @@ import pickle
 import stat
 import warnings
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, InvalidStateError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -183,7 +183,7 @@ class Compiler:
     """Compiles the programs of a run in its own threads, until the end of the block."""
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
-        self.monitor, self.kept, self.is_closed = monitor, kept, False
+        self.monitor, self.kept = monitor, kept
         self.threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
 
     def __enter__(self) -> "Compiler":
@@ -191,21 +191,16 @@ class Compiler:
 
     def __exit__(self, *_: object) -> None:
         """Cancels pending work, which would keep the process alive."""
-        self.is_closed = True
         self.threads.shutdown(wait=False, cancel_futures=True)
 
 
 class Program:
-    """A function of a stage, compiled in the background.
-
-    May be called before `compile`, from another thread; the call blocks until it is compiled.
-    """
+    """A function of a stage, compiled in the background; a call blocks until it is compiled."""
 
     def __init__(self, compiler: Compiler, stage: str, name: str, closed: object = ()):
         """A program without a function yet; for `closed` see `Kept.find_or_trace`."""
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name, self._closed = stage, name, closed
-        self._compiled: Future[Function] = Future()
         self._places: tuple[jax.sharding.NamedSharding, ...] | None = None
 
     def compile(
@@ -228,26 +223,17 @@ class Program:
         Returns:
           Shapes of the results.
         """
-        if self._compiler.is_closed:
-            raise CancelledError
         with self.measure("compile_s"):
             lowered = self._lower(function, args, mesh, whole)
 
-        def compile_lowered() -> None:
-            if self._compiled.done():  # released
-                return
-            try:
-                with self.measure("compile_s"):
-                    supported = devices.compiler_options(**options)
-                    compiled = lowered.compile(compiler_options=supported)
-            except Exception as error:
-                self._monitor.fail(error)
-                return
-            with contextlib.suppress(InvalidStateError):  # released
-                self._compiled.set_result(compiled)
+        def compile_lowered() -> Function:
+            with self.measure("compile_s"):
+                supported = devices.compiler_options(**options)
+                compiled = lowered.compile(compiler_options=supported)
             devices.give_back_freed()
+            return compiled
 
-        self._compiler.threads.submit(compile_lowered)
+        self._compiled = self._compiler.threads.submit(compile_lowered)
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lowered.out_info)
 
     def _lower(
@@ -276,18 +262,11 @@ class Program:
         """Adds the seconds of a block to those of the stage."""
         return self._monitor.measure(kind, self._stage)
 
-    def release(self) -> None:
-        """Lets go of the compiled program, which holds tens of MiB; nobody may call it again."""
-        released = Future[Function]()
-        released.set_exception(RuntimeError(f"{self._name} of {self._stage} was released"))
-        self._compiled = released
-
     def wait(self) -> Function:
         """Blocks until the program is compiled; raises what `Monitor.check_stop` does."""
         if not self._compiled.done():
             self._monitor.progress(self._stage, 0, 0)
-            return self._monitor.wait_for(self._compiled)
-        return self._compiled.result()
+        return self._monitor.wait_for(self._compiled)
 
     def run(self, *args: PyTree) -> PyTree[jax.Array]:
         """Runs the program, and returns before its results are ready."""
@@ -312,7 +291,6 @@ class RowProgram:
 
     def __init__(self, program: Program, workers: Workers):
         self._program, self._workers = program, workers
-        self._results = Future[PyTree]()  # their shapes
 
     def compile(
         self, function: Function, *args: PyTree, whole: int
@@ -327,14 +305,13 @@ class RowProgram:
         self._rows = [np.arange(i * size, (i + 1) * size) % number for i in range(calls)]
         some = jax.tree.map(lambda x: x.update(shape=(size, *x.shape[1:])), shapes[whole:])
         results = self._program.compile(function, *shapes[:whole], *some, mesh=mesh, whole=whole)
-        results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
-        self._results.set_result(results)
-        return results
+        self._results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
+        return self._results
 
     def __call__(self, *args: PyTree) -> PyTree[np.ndarray]:
         """Runs the program for all rows."""
         self._program.wait()
-        results = jax.tree.map(devices.empty, self._results.result())
+        results = jax.tree.map(devices.empty, self._results)
 
         def run(rows: np.ndarray) -> None:
             some = jax.tree.map(lambda x: x[rows], args[self._whole :])

@@ -84,7 +84,7 @@ class Monitor:
 
     def fail(self, failure: BaseException) -> None:
         """Stops everything that runs or waits beside what has failed."""
-        self._failure = failure
+        self._failure = self._failure or failure
 
     @property
     def is_stopping(self) -> bool:

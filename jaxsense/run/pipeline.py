@@ -232,7 +232,7 @@ class _Training:
                 raise
             self.programs.monitor.warn(f"{error}: left out")
             self.curves[stage.name] = self._no_curves(stage)
-            return _failed(self.programs.shapes(stage).output)
+            return _failed(programs.output)
         return programs.finish(config, state, inputs)
 
     def _run_chunks(
@@ -300,12 +300,12 @@ class _Training:
             if curves is None:
                 return None
             self.curves[stage.name] = curves
-        output = self.programs.shapes(stage).output
+        output = self.programs.of(stage).output
         return self.checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
 
     def _no_curves(self, stage: Stage) -> Curves:
         """The curves of a training that has not begun, or has failed."""
-        lengths = dict.fromkeys(self.programs.shapes(stage).metrics, stage.steps)
+        lengths = dict.fromkeys(self.programs.of(stage).metrics, stage.steps)
         lengths["seconds"] = stage.chunks
         return {name: np.full(length, np.nan, np.float32) for name, length in lengths.items()}
 

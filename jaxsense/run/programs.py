@@ -32,27 +32,19 @@ _HAS_ROWS = ("survey",)  # whose inputs and outputs are independent rows, which 
 _RUNS_LONG = ("jmvae",)
 
 
-class Shapes(NamedTuple):
-    """Shapes and dtypes of a stage's output, and the names of the metrics of its steps."""
+class StagePrograms(NamedTuple):
+    """The programs of a stage, see `Stage`; without steps, the first alone is compiled.
 
+    Attributes:
+      output: shapes and dtypes of the stage's output.
+      metrics: names of the metrics of its steps.
+    """
+
+    begin: Program | RowProgram
+    advance: Program
+    finish: Program
     output: Output
-    metrics: tuple[str, ...] = ()
-
-
-class StagePrograms:
-    """The programs of a stage, see `Stage`; `shapes` are known once they are traced."""
-
-    def __init__(self, compiler: Compiler, name: str, workers: Workers):
-        self._all = [Program(compiler, name, part) for part in ("begin", "advance", "finish")]
-        self.begin, self.advance, self.finish = self._all
-        if name in _HAS_ROWS and (_on_cpu() or workers.mesh is not None):
-            self.begin = RowProgram(self.begin, workers)
-        self.shapes: Future[Shapes] = Future()
-
-    def release(self) -> None:
-        """Lets go of the compiled programs."""
-        for program in self._all:
-            program.release()
+    metrics: tuple[str, ...]
 
 
 class Programs:
@@ -79,24 +71,20 @@ class Programs:
         self.player: Future[missions.Player] = Future()
         self._compiler, self._workers, self._policies = compiler, workers, policies
         names = [stage.program for stage in self.stages]
-        self._of = {name: StagePrograms(compiler, name, workers) for name in names}
+        self._of = {name: Future[StagePrograms]() for name in names}
         self._left, self._lock = Counter(trainings * names), threading.Lock()
         threading.Thread(target=self._trace, name="trace").start()
 
     def of(self, stage: Stage) -> StagePrograms:
-        """The programs of a stage."""
-        return self._of[stage.program]
-
-    def shapes(self, stage: Stage) -> Shapes:
-        """Shapes of a stage, once it is traced."""
-        return self.monitor.wait_for(self.of(stage).shapes)
+        """The programs of a stage, once they are traced."""
+        return self.monitor.wait_for(self._of[stage.program])
 
     def used(self, stage: Stage) -> None:
         """Notes that a training is done with a stage, and lets go of programs that none needs."""
         with self._lock:
             self._left[stage.program] -= 1
             if self._left[stage.program] == 0:
-                self.of(stage).release()
+                self._of[stage.program] = Future()
 
     def _trace(self) -> None:
         """Traces all programs."""
@@ -127,34 +115,35 @@ class Programs:
 
     def _compile(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """Shapes of a stage's output; compiles its programs unless an earlier stage shares them."""
-        compiled, key, config = self.of(stage), jax.random.key(0), self.config
-        if compiled.shapes.done():
-            return compiled.shapes.result().output
+        name, key, config = stage.program, jax.random.key(0), self.config
+        if self._of[name].done():
+            return self._of[name].result().output
 
-        def begin(key: Key, config: Config, inputs: dict[str, Output]) -> Output:
+        def first(key: Key, config: Config, inputs: dict[str, Output]) -> Output:
             return stage.begin(key, config, **inputs)
 
-        def finish(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
+        def last(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
             return stage.finish(config, state, **inputs)
 
-        state = compiled.begin.compile(begin, key, config, inputs, whole=2)
+        begin, advance, finish = (
+            Program(self._compiler, name, part) for part in ("begin", "advance", "finish")
+        )
+        if name in _HAS_ROWS and (_on_cpu() or self._workers.mesh is not None):
+            begin = RowProgram(begin, self._workers)
+        state = begin.compile(first, key, config, inputs, whole=2)
         if (step := stage.advance) is None:
-            shapes = Shapes(jax.eval_shape(lambda *args: finish(config, *args), state, inputs))
+            output, metrics = jax.eval_shape(lambda *args: last(config, *args), state, inputs), ()
         else:
 
-            def advance(
-                key: Key, config: Config, state: Output, inputs: dict[str, Output]
-            ) -> Output:
+            def chunk(key: Key, config: Config, state: Output, inputs: dict[str, Output]) -> Output:
                 return step(key, config, state, **inputs)
 
-            runs_long = _on_cpu() and stage.program in _RUNS_LONG
-            _, progress = compiled.advance.compile(
-                advance, key, config, state, inputs, runs_long=runs_long
-            )
-            output = compiled.finish.compile(finish, config, state, inputs)
-            shapes = Shapes(output, tuple(progress.metrics))
-        compiled.shapes.set_result(shapes)
-        return shapes.output
+            runs_long = _on_cpu() and name in _RUNS_LONG
+            _, progress = advance.compile(chunk, key, config, state, inputs, runs_long=runs_long)
+            output = finish.compile(last, config, state, inputs)
+            metrics = tuple(progress.metrics)
+        self._of[name].set_result(StagePrograms(begin, advance, finish, output, metrics))
+        return output
 
 
 def _on_cpu() -> bool:
