@@ -120,8 +120,8 @@ class Reliability:
     """Points of a reliability diagram, one for each of B bins of confidence.
 
     Attributes:
-      confidence: `[B]` mean probability of the most likely label; NaN in an empty bin.
-      accuracy: `[B]` share of right labels; NaN in an empty bin.
+      confidence: `[B]` mean probability of the most likely label; 0 in an empty bin.
+      accuracy: `[B]` share of right labels; 0 in an empty bin.
       looks: `[B]` float32 number of looks.
     """
 

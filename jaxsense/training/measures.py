@@ -60,7 +60,7 @@ def calibration_error(found: Reliability) -> Float[Array, ""]:
     The difference between mean confidence and accuracy in a bin, averaged over all looks.
     """
     share = found.looks / jnp.sum(found.looks)
-    return jnp.sum(jnp.where(share > 0, share * jnp.abs(found.confidence - found.accuracy), 0.0))
+    return jnp.sum(share * jnp.abs(found.confidence - found.accuracy))
 
 
 def diagram(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Reliability:
@@ -71,7 +71,8 @@ def diagram(probabilities: Float[Array, "S L"], labels: Int[Array, " S"]) -> Rel
     bins = jnp.clip(jnp.ceil(confidence * _BINS).astype(jnp.int32) - 1, 0, _BINS - 1)
     of_looks = jnp.stack([confidence, is_right, jnp.ones(len(labels))])
     sums = jnp.zeros((3, _BINS)).at[:, bins].add(of_looks)
-    return Reliability(sums[0] / sums[2], sums[1] / sums[2], sums[2])
+    confidence, accuracy = sums[:2] / jnp.maximum(sums[2], 1)[None]
+    return Reliability(confidence, accuracy, sums[2])
 
 
 def latent_space(
