@@ -171,7 +171,7 @@ def surveys(
     keys: Key,
     world: World,
     classes: Int[Array, "S N"],
-    is_empty: Bool[Array, " S"] | None = None,
+    is_empty: Bool[Array, " S"],
     places: Key | None = None,
 ) -> tuple[tuple[Float[Array, "S N _"], ...], Float[Array, "S M N"]]:
     """Surveys many scenes, see `sim.world.survey`.
@@ -281,7 +281,8 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     def look(key: Key, world: World, models: Models) -> Samples:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
-        seen, distances = surveys(jax.random.split(survey_key, number), world, classes)
+        keys, is_empty = jax.random.split(survey_key, number), jnp.zeros(number, bool)
+        seen, distances = surveys(keys, world, classes, is_empty)
         found = features(models.detectors, seen, distances)
         return tuple(by_class(x, classes, num_classes, samples) for x in found)
 

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Reliability
@@ -246,10 +245,6 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
     right.plot(belief["looks"], belief["bayes_nll"], "s--", label="exact Bayes", **style)
     right.set(xlabel="looks", ylabel="NLL of the true class [nats]", yscale="log")
     right.set_xticks(belief["looks"])
-    # Plain numbers on the logarithmic axis.
-    right.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    right.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    right.yaxis.set_minor_formatter(NullFormatter())
     for ax in (left, right):
         ax.grid(alpha=0.3)
         ax.legend(ncols=3, **_ABOVE)

@@ -256,13 +256,13 @@ def survey(
     key: Key,
     world: World,
     classes: Int[Array, "N"],
-    is_empty: Bool[Array, ""] | None = None,
+    is_empty: Bool[Array, ""],
     places: Key | None = None,
 ) -> tuple[tuple[Float[Array, "N _"], ...], Float[Array, "R N"]]:
     """Draws a scene in which each robot looks at each PoI, every time from a new viewpoint.
 
     Args:
-      is_empty: whether no look shows its PoI, see `viewpoints.without_poi`; all do by default.
+      is_empty: whether no look shows its PoI, see `viewpoints.without_poi`.
       places: see `random_scene`.
 
     Returns:
@@ -284,12 +284,10 @@ def survey(
         bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
         poses = scene.poses.at[robot].set(pose)
         view = View(scene.layout.position, poses, away, bearing, distance)
-        if is_empty is None:
-            return view
         absent = viewpoints.without_poi(
             absent_key, world.sensors, world.arena.config, world.viewpoint, view, robot, poi
         )
-        return jax.tree.map(lambda *x: jnp.where(jnp.asarray(is_empty), *x), absent, view)
+        return jax.tree.map(lambda *x: jnp.where(is_empty, *x), absent, view)
 
     of_pois = jax.vmap(view_of, in_axes=(0, None, 0))
     each = jax.vmap(of_pois, in_axes=(0, 0, None))
@@ -300,8 +298,7 @@ def survey(
         def read(key: Key, view: View) -> jax.Array:
             layout = dataclasses.replace(scene.layout, position=view.positions)
             stood = Scene(layout, scene.light, view.poses)
-            twin = None if is_empty is None else view.twin
-            return window_around(key, world, stood, robot, view.bearing, twin)
+            return window_around(key, world, stood, robot, view.bearing, view.twin)
 
         return jax.vmap(read)(noise_keys[robot], jax.tree.map(lambda x: x[robot], views))
 

@@ -304,7 +304,7 @@ FUNCTIONS = [
     ),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, -2), "robot = -2: must be -1 or one of"),
     (lambda w: sim.cross_section(w.world.arena, None, 0.1, 2), "robot = 2: must be -1 or one of"),
-    (lambda w: survey(0, w.world, w.classes), "key = 0: must be one key"),
+    (lambda w: survey(0, w.world, w.classes, False), "key = 0: must be one key"),
     (lambda w: random_light(0), "key = 0: must be one key"),
     (lambda w: Light(w.x, 1.0, 1.0).changes(), "conditions = None"),
     (lambda w: Light(w.x, 1.0, 1.0, random_conditions(w.key)).changes(), "light.point = None"),
