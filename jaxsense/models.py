@@ -10,8 +10,9 @@ from jaxtyping import Array, Bool, Float
 from jaxsense.config import Config
 from jaxsense.config.mission import Search
 from jaxsense.config.scene import MAX_BEARING
-from jaxsense.core import checks
+from jaxsense.core import checks, novelty
 from jaxsense.core.networks import Params
+from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Fusion, Key, pytree
 from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn.agent import Agent
@@ -20,12 +21,11 @@ from jaxsense.dqn.team import Travel
 from jaxsense.sim import sensors, windows
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.windows import Domain, make_domain
-from jaxsense.vae import detectors, frames, fusion, jmvae, leave_one_out, novelty, readout
+from jaxsense.vae import detectors, frames, fusion, jmvae, leave_one_out, readout
 from jaxsense.vae.detectors import Classifier, Detection, Detector
 from jaxsense.vae.frames import Chromaticity, Frame, Scaling
 from jaxsense.vae.jmvae import Jmvae
 from jaxsense.vae.leave_one_out import Encoder
-from jaxsense.vae.novelty import Novelty
 from jaxsense.vae.readout import Bayes, Readout
 
 _NO_SEARCH = Search()

@@ -28,7 +28,7 @@ class DetectorConfig(Section, place="detector"):
         likelihood.
       num_held_out: Simulated scans for measuring the accuracy.
       num_repeats: Scenes in which each sensor looks at a PoI several times, to learn how much of a
-        look is new after others nearby, see `vae.Novelty`. With 0, every look counts in full.
+        look is new after others nearby, see `core.novelty`. With 0, every look counts in full.
       steps: Gradient steps.
       batch: Scans per gradient step.
       learning_rate: Initial learning rate of Adam; decays to zero along a cosine.

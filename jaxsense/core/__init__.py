@@ -1,1 +1,1 @@
-"""The lowest layer: types, argument checks, networks and the supervised fit."""
+"""The lowest layer: types, argument checks, networks, the supervised fit, how new a look is."""

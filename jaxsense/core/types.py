@@ -163,7 +163,7 @@ class Fusion(Protocol):
           seen: which modalities have looked before.
           features: probabilities of the labels.
           modality: index of the sensor; static.
-          weight: share of the look that is new evidence, see `vae.Novelty`.
+          weight: share of the look that is new evidence, see `core.novelty`.
         """
         ...
 
@@ -173,18 +173,6 @@ class Fusion(Protocol):
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
         """Probability of each class according to a `[D]` belief."""
-        ...
-
-
-class Novelty(Protocol):
-    """Protocol of how new a look is after earlier ones from nearby; see `vae.Novelty`."""
-
-    def weight(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """Share of a look that is new evidence, by the distances of earlier looks in metres."""
-        ...
-
-    def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """Metres to where a look is new enough."""
         ...
 
 

@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
-from jaxsense.core.types import Belief, Fusion, Index, Key, Novelty, Scene, call, pytree
+from jaxsense.core.novelty import Novelty
+from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
 from jaxsense.dqn.rewards import Reward
 from jaxsense.dqn.team import (
     Steps,

@@ -8,7 +8,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.learning import TeamConfig
-from jaxsense.core.types import Belief, Index, Key, Novelty, pytree
+from jaxsense.core.novelty import Novelty
+from jaxsense.core.types import Belief, Index, Key, pytree
 
 TIME_SCALE = 10.0
 """Unit of travel times in observations, in seconds."""

@@ -217,7 +217,7 @@ class SharedMap(Contents):
         """What one more look changes.
 
         Args:
-          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+          weight: `[]` share of the look that is new evidence, see `core.novelty`.
         """
         belief, seen = jax.tree.map(lambda x: x[poi], (self.belief, self.times_seen > 0))
         return Learned(
@@ -276,7 +276,7 @@ class OwnMap:
         """What one more look changes in the map of all looks, and what the robot remembers of it.
 
         Args:
-          weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+          weight: `[]` share of the look that is new evidence, see `core.novelty`.
         """
         found = Evidence(
             log_likelihood=log_likelihood(models, features, modality, weight),
@@ -297,7 +297,7 @@ def log_likelihood(
     """Log-likelihoods of the classes given one look, up to a constant.
 
     Args:
-      weight: `[]` share of the look that is new evidence, see `vae.Novelty`.
+      weight: `[]` share of the look that is new evidence, see `core.novelty`.
     """
     fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
     alone = fusion.update(fusion.prior, nobody, features, modality, weight)

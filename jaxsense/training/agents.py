@@ -11,7 +11,8 @@ from jaxtyping import Array, Int
 
 from jaxsense.config import Config
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Fusion, Key, Novelty
+from jaxsense.core.novelty import Novelty
+from jaxsense.core.types import Belief, Fusion, Key
 from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Environment, Underway

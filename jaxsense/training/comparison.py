@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config
+from jaxsense.core import novelty
 from jaxsense.core.networks import Params
 from jaxsense.core.types import Fusion, Index, Key
 from jaxsense.dqn import episodes, policies
@@ -22,7 +23,6 @@ from jaxsense.looks import Bank, mdp_of_one
 from jaxsense.models import Models, make_bayes, make_models
 from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Output
-from jaxsense.vae import novelty
 
 COMPARED = ("latent", "optimal", "greedy", "naive", "random")
 """Names of the policies to compare in the map MDP, from `dqn.policies.POLICIES`; `optimal` is the

@@ -14,7 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense import looks
 from jaxsense.config import Config
+from jaxsense.core import novelty
 from jaxsense.core.networks import Params
+from jaxsense.core.novelty import Novelty
 from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Key, Samples, pytree
 from jaxsense.models import make_bayes, make_detector
@@ -22,9 +24,8 @@ from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.sim.world import make_world
 from jaxsense.training.stage import Fit, Output, Stage, fit_stage
-from jaxsense.vae import detectors, novelty
+from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Classifier, Detector, Looks
-from jaxsense.vae.novelty import Novelty
 
 T = TypeVar("T")
 
@@ -303,7 +304,7 @@ def learn_novelty(
     scenes: Scenes,
     shown: Shown | None = None,
 ) -> Novelty:
-    """Learns how much of a look is new, see `vae.Novelty`; without repeated looks, all of it."""
+    """Learns how much of a look is new, see `core.novelty`; without repeated looks, all of it."""
     number = config.detector.num_repeats
     if not number:
         return novelty.independent(len(trained))

@@ -62,7 +62,7 @@ class Bayes:
     ) -> Float[Array, " C"]:
         """Normalised logarithms of the classes' probabilities after one more look.
 
-        `weight` is the share of the look that is new evidence, see `vae.Novelty`.
+        `weight` is the share of the look that is new evidence, see `core.novelty`.
         """
         chex.assert_shape(log_posterior, self.labels.shape[1:])
         # Rejects -inf (all classes excluded) and NaN.

@@ -8,10 +8,10 @@ from smoke import save_models
 from untrained import untrained
 
 from jaxsense import export
+from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief
 from jaxsense.models import make_in_place
 from jaxsense.run.rundir import RunDirectory, Settings
-from jaxsense.vae.novelty import Novelty
 
 
 @pytest.fixture(scope="session")

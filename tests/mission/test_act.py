@@ -9,6 +9,7 @@ import pytest
 from teams import AHEAD, CONFIG
 
 from jaxsense.config.mission import CONTROL_PERIOD
+from jaxsense.core.novelty import Novelty
 from jaxsense.mission import act
 from jaxsense.mission.state import (
     ATTEMPTS,
@@ -20,7 +21,6 @@ from jaxsense.mission.state import (
     RECENT_LOOKS,
     Faults,
 )
-from jaxsense.vae.novelty import Novelty
 
 CAMERA, LIDAR = 0, 1
 AWAY = [0.0, 1.2, 0.0]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from teams import LATENT, POSES, POSITIONS, with_values
 
+from jaxsense.core.novelty import Novelty
 from jaxsense.mission import act
 from jaxsense.mission.decide import RECOVERY_TIME
 from jaxsense.mission.state import BACKING, DRIVING, ENDED, FACING, IDLE
-from jaxsense.vae.novelty import Novelty
 
 # Half of a look is new at .5 sqrt(2 ln(.83 / .414)) = .59 m.
 STAYS_OLD = Novelty(strength=jnp.full(2, 2 * (np.sqrt(2.0) - 1)), length=jnp.full(2, 0.5))

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsense.vae import novelty
-from jaxsense.vae.novelty import Novelty
+from jaxsense.core import novelty
+from jaxsense.core.novelty import Novelty
 
 TWO = Novelty(strength=jnp.array([1.0, 0.3]), length=jnp.array([0.5, 1.0]))
 NONE = np.inf
