@@ -77,8 +77,8 @@ class Arguments(Checked):
     tensorboard: bool = False
     devices: int | None = limited(None, at_least=1, at_most=MAX_DEVICES)
     coordinator: str | None = None
-    num_processes: int | None = None
-    process_index: int | None = None
+    num_processes: int | None = limited(None, at_least=1)
+    process_index: int | None = limited(None, at_least=0)
     cache: Path | None = cli.CACHE
 
 

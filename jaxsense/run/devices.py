@@ -291,8 +291,6 @@ def join(
     if not (host and port.isascii() and port.isdigit() and 0 < int(port) < 2**16):
         reason = "must be HOST:PORT, with a port from 1 to 65535"
         raise ConfigError("coordinator", coordinator, reason)
-    if number < 1:
-        raise ConfigError("num_processes", number, "must be greater than 0")
     if not 0 <= index < number:
         raise ConfigError("process_index", index, f"must be from 0 to {number - 1}")
     try:

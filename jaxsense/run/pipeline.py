@@ -1,10 +1,9 @@
 """A whole run: trains stage after stage, plays the missions, and summarises both."""
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, InvalidStateError, ThreadPoolExecutor, as_completed
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 
 import jax
 import numpy as np
@@ -144,17 +143,16 @@ def train(key: Key, programs: Programs, checkpoints: Checkpoints) -> Trained:
     training = _Training(key, programs, checkpoints)
     outputs = dict[str, Future[Output]]()
     with ThreadPoolExecutor(_MAX_THREADS, "stage") as threads:
-        running = set[Future[None]]()
 
         def drive(stage: Stage, **inputs: Output) -> Future[Output]:
-            output = outputs[stage.name] = Future[Output]()
-            running.add(threads.submit(training.run, stage, inputs, output))
-            return output
+            outputs[stage.name] = threads.submit(training.run, stage, inputs)
+            return outputs[stage.name]
 
         stages.train(drive, programs.config)
+        done = as_completed([*outputs.values()])
         kept = {name: x for name, x in outputs.items() if name not in _ONLY_PASSED_ON}
         outputs.clear()
-        for _ in as_completed(running):
+        for _ in done:
             devices.give_back_freed()
     programs.monitor.check_stop()
     return Trained({name: output.result() for name, output in kept.items()}, training.curves)
@@ -169,26 +167,22 @@ class _Training:
     checkpoints: Checkpoints
     curves: dict[str, Curves] = dataclasses.field(default_factory=dict)
 
-    def run(
-        self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]], output: Future[Output]
-    ) -> None:
-        """Gives a stage its output, loaded if it was saved; saves it while others go on."""
+    def run(self, stage: Stage, inputs: dict[str, PyTree[Future[Output]]]) -> Output:
+        """The output of a stage, loaded if it was saved."""
         is_saved = bool(stage.chunks) or stage.name in _SAVED
         try:
-            found = self._load(stage) if is_saved else None
-            is_new = found is None
-            if is_new:
-                found = self._execute(stage, inputs)
-            output.set_result(found)
-            if is_saved and is_new:
-                if stage.chunks:
-                    self.checkpoints.save(f"curves_{stage.name}", self.curves[stage.name])
-                self.checkpoints.save(stage.name, found)
+            if is_saved and (found := self._load(stage)) is not None:
+                return found
+            output = self._execute(stage, inputs)
+            if stage.chunks:
+                self.checkpoints.save(f"curves_{stage.name}", self.curves[stage.name])
+            if is_saved:
+                self.checkpoints.save(stage.name, output)
+            return output
         except BaseException as error:
             if not isinstance(error, Stopped):
                 self.programs.monitor.fail(error)
-            with contextlib.suppress(InvalidStateError):  # it could not be saved
-                output.set_exception(error)
+            raise
         finally:
             self.programs.used(stage)
 
@@ -196,7 +190,12 @@ class _Training:
         """The output of a stage that was not saved."""
         given = jax.tree.map(lambda x: x.result() if isinstance(x, Future) else x, inputs)
         self.programs.monitor.check_stop()
-        output = (self._train if stage.chunks else self._once)(stage, given)
+        if stage.chunks:
+            output = self._train(stage, given)
+        else:
+            output = stage.finish(self.programs.config, self._begin(stage, given), **given)
+            # Joined rows lie on the host, and every program would transfer them again.
+            output = jax.device_put(output)
         if not (stage.is_optional or is_finite(output)):
             raise StageError(f"{stage.name}: results are not finite")
         return output
@@ -204,12 +203,6 @@ class _Training:
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The first state."""
         return self.programs.of(stage).begin(stage.key(self.key), self.programs.config, inputs)
-
-    def _once(self, stage: Stage, inputs: dict[str, Output]) -> Output:
-        """The output of a stage without steps."""
-        output = stage.finish(self.programs.config, self._begin(stage, inputs), **inputs)
-        # Joined rows lie on the host, and every program would transfer them again.
-        return jax.device_put(output)
 
     def _train(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The output of a stage with steps."""

@@ -64,6 +64,8 @@ def refusal(program, argv, place, capsys) -> str:
 TRAIN = [
     (["--seed"], "option = '--seed': expected one argument"),
     (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
+    (["--num-seeds", "0"], "num_seeds = 0: must be a whole number, from 1 to 10,000"),
+    (["--num-seeds", "2", "--seed", str(2**32 - 1)], "num_seeds = 2: leads beyond seed 2^32"),
     (["--cache", 300 * "x"], "cache = 'xxx"),
     (["--preset", ""], "preset = '': must be one of default, paper, noisy, many, raw, team"),
     (["--out", ""], "out = '': must be a path"),

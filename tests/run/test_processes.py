@@ -101,7 +101,6 @@ def test_two_processes_stop_and_resume_several_seeds(tmp_path):
         (("localhost:99999", 2, 0), "must be HOST:PORT, with a port from 1 to 65535"),
         (("no.host.invalid:1", 2, 1), "coordinator = 'no.host.invalid:1': cannot be found"),
         (("localhost:1", 2, 2), "process_index = 2: must be from 0 to 1"),
-        (("localhost:1", 0, 0), "num_processes = 0: must be greater than 0"),
     ],
 )
 def test_processes_that_cannot_be_are_named(given, expected, capsys):
