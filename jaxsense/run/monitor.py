@@ -112,25 +112,3 @@ class Monitor:
         """
         with self._lock:
             self._listener(stage, done, total, metrics)
-
-    def report(
-        self, stage: str, done: int, total: int, losses: np.ndarray, **metrics: float
-    ) -> None:
-        """Reports a chunk of training.
-
-        Args:
-          stage: its name.
-          done: steps so far, including the chunk.
-          total: steps of the whole stage.
-          losses: `[steps]` of the chunk; their mean is reported. The last is not finite if the
-            parameters after it are not, see `supervised.fit` and `dqn.train_chunk`.
-          **metrics: other metrics.
-
-        Raises:
-          StageError: if a loss is not finite; names the step.
-        """
-        bad = np.flatnonzero(~np.isfinite(losses))
-        if len(bad):
-            step = done - len(losses) + bad[0] + 1
-            raise StageError(f"{stage}: loss = {losses[bad[0]]} at step {step} of {total}")
-        self.progress(stage, done, total, loss=float(np.mean(losses)), **metrics)

@@ -272,18 +272,27 @@ class _Training:
         return state
 
     def _report(self, stage: Stage, chunk: int, progress: Progress) -> Curves:
-        """Reports a chunk, checks its losses, and returns the steps' metrics."""
+        """Reports a chunk and returns the steps' metrics.
+
+        Raises:
+          StageError: if a loss is not finite, or the parameters after the last step, whose loss is
+            not finite then, see `supervised.fit` and `dqn.train_chunk`.
+        """
         size = len(progress.loss)
         done = min((chunk + 1) * size, stage.steps)
         losses, metrics = jax.tree.map(
             lambda x: np.asarray(x)[: done - chunk * size], (progress.loss, progress.metrics)
         )
+        bad = np.flatnonzero(~np.isfinite(losses))
+        if len(bad):
+            where = f"at step {chunk * size + bad[0] + 1} of {stage.steps}"
+            raise StageError(f"{stage.name}: loss = {losses[bad[0]]} {where}")
         means = {
             name: float(np.nanmean(values))
-            for name, values in metrics.items()
+            for name, values in {"loss": losses, **metrics}.items()
             if np.isfinite(values).any()
         }
-        self.programs.monitor.report(stage.name, done, stage.steps, losses, **means)
+        self.programs.monitor.progress(stage.name, done, stage.steps, **means)
         return metrics
 
     def _load(self, stage: Stage) -> Output:

@@ -140,10 +140,9 @@ def remarks(found: Summary) -> list[str]:
 
 
 def verdict(played: Missions) -> str | None:
-    """Compares the latent policy with naive exploration, and its time with the fastest policy's.
+    """Compares median times: the latent policy's, naive exploration's and the fastest policy's.
 
-    A sentence about median times and, if it differs, one about accuracy; None unless both policies
-    were played.
+    Policies that are less often right do not count. None unless the first two were played.
     """
     if not {REFERENCE, "naive"} <= set(played):
         return None
@@ -169,8 +168,4 @@ def verdict(played: Missions) -> str | None:
     ]
     if faster:
         text += f" (and {against(max(faster, key=lambda name: ratios[name]))})"
-    right, usual = accuracy[REFERENCE], accuracy["naive"]
-    if abs(right - usual) >= _AS_ACCURATE:
-        text += f". It labels {100 * right:.1f}\u00a0% of the PoIs right, naive exploration "
-        text += f"{100 * usual:.1f}\u00a0%"
     return f"{text}."

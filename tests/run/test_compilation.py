@@ -32,9 +32,8 @@ def call(kept, function, *args, name="run"):
         return program(*args)
 
 
-def test_compiling_and_running_are_timed_apart_and_reported():
-    heard = []
-    monitor = Monitor(lambda *report: heard.append(report))
+def test_compiling_and_running_are_timed_apart():
+    monitor = Monitor()
     program = Program(Compiler(monitor), "stage", "run")
     shape = program.compile(lambda x: 2 * x, jnp.float32(3))
     assert (shape.shape, shape.dtype) == ((), jnp.float32)
@@ -44,9 +43,6 @@ def test_compiling_and_running_are_timed_apart_and_reported():
     assert list(timing["stages"]) == ["stage"]
     assert 0 < seconds["run_s"] < seconds["compile_s"]
     assert seconds["run_s"] + seconds["compile_s"] < timing["total_s"]
-    monitor.report("stage", 2, 4, np.array([1.0, 3.0]), epsilon=0.5)
-    heard = [report for report in heard if report[2]]  # it may have been compiled in time
-    assert heard == [("stage", 2, 4, {"loss": 2.0, "epsilon": 0.5})]
 
 
 TOLD = "jaxsense: {}: a program must be traced again ("
