@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -15,33 +15,21 @@ from jaxsense.core.types import Key, pytree
 D = TypeVar("D")
 
 
-class FitConfig(Protocol):
-    """Settings of a fit."""
-
-    @property
-    def learning_rate(self) -> float:
-        """Adam's learning rate in the first step; it falls to zero along a cosine."""
-        ...
-
-    @property
-    def steps(self) -> int:
-        """Gradient steps of the whole fit."""
-        ...
-
-
 @dataclasses.dataclass(frozen=True)
 class Problem(Generic[D]):
     """A loss to minimise, with its data.
 
     Attributes:
-      config: settings of the fit.
+      steps: gradient steps of the whole fit.
+      learning_rate: Adam's in the first step; it falls to zero along a cosine.
       draw: `(key, number) -> [number, ...]` random values of all steps, much cheaper together than
         step by step.
       loss: `(params, drawn, step) -> []` loss of one step of the whole fit, with a row of what
         `draw` returns.
     """
 
-    config: FitConfig
+    steps: int
+    learning_rate: float | jax.Array
     draw: Callable[[Key, int], D]
     loss: Callable[[Params, D, Int[Array, ""]], Float[Array, ""]]
 
@@ -61,17 +49,17 @@ class FitState:
     loss: jax.Array
 
 
-def _adam(config: FitConfig) -> optax.GradientTransformation:
+def _adam(problem: Problem[D]) -> optax.GradientTransformation:
     """Adam with a learning rate that falls to zero along a cosine."""
     # Flattened: for networks this small, per-array overhead dominates.
     return optax.flatten(
-        optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
+        optax.adam(optax.cosine_decay_schedule(problem.learning_rate, problem.steps))
     )
 
 
-def start(params: Params, config: FitConfig) -> FitState:
+def start(params: Params, problem: Problem[D]) -> FitState:
     """State before the first step."""
-    return FitState(params, _adam(config).init(params), jnp.int32(0), jnp.float32(jnp.inf))
+    return FitState(params, _adam(problem).init(params), jnp.int32(0), jnp.float32(jnp.inf))
 
 
 def fit(
@@ -83,7 +71,7 @@ def fit(
       The state after the last step and the losses, without meaning beyond the end of the fit. The
       last one of the fit is NaN if the parameters after it are not finite.
     """
-    optimiser, total = _adam(problem.config), problem.config.steps
+    optimiser, total = _adam(problem), problem.steps
     drawn = problem.draw(key, number)
 
     def make_step(state: FitState, drawn: D) -> tuple[FitState, jax.Array]:

@@ -258,7 +258,7 @@ def detector_stage(
 
         return Fit(untrained, problem, trained)
 
-    return fit_stage(f"detector_{config.modalities[modality]}", config.detector, fit)
+    return fit_stage(f"detector_{config.modalities[modality]}", config.detector.steps, fit)
 
 
 def _divided(rows: T, number: int) -> tuple[T, T]:

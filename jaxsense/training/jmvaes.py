@@ -74,7 +74,7 @@ def fit_in_place(
     """Fusion in place, with decoders that have learned to decode beliefs."""
     settings = dataclasses.replace(config.jmvae, steps=-(-config.jmvae.steps // 3))
     problem = fusion.decoding(settings, detections.bank, make_jmvae(config), params)
-    start = supervised.start(params["decoders"], settings)
+    start = supervised.start(params["decoders"], problem)
     fit, _ = supervised.fit(key, start, problem, settings.steps)
     return make_in_place(config, {**params, "decoders": fit.params}, classes)
 
@@ -93,4 +93,4 @@ def filter_stage(config: Config) -> Stage:
             lambda found, fit: dataclasses.replace(found, networks=fit.params),
         )
 
-    return fit_stage("filter", config.filter, fit)
+    return fit_stage("filter", config.filter.steps, fit)

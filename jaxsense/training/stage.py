@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jaxsense.config import Config
 from jaxsense.core import supervised
 from jaxsense.core.networks import Params
-from jaxsense.core.supervised import FitConfig, FitState, Problem
+from jaxsense.core.supervised import FitState, Problem
 from jaxsense.core.types import Key, pytree
 
 _MAX_CHUNKS = 20
@@ -108,19 +108,18 @@ class Fit:
     trained: Callable[[Any, FitState], Output]
 
 
-def fit_stage(name: str, settings: FitConfig, fit: Callable[..., Fit]) -> Stage:
+def fit_stage(name: str, steps: int, fit: Callable[..., Fit]) -> Stage:
     """Makes a stage that fits a network.
 
     Args:
-      name: of the stage.
-      settings: only the number of steps matters.
-      fit: `(config, **inputs) -> Fit`.
+      fit: `(config, **inputs) -> Fit`, whose problem has these `steps`.
     """
-    size, chunks = in_chunks(settings.steps)
+    size, chunks = in_chunks(steps)
 
     def begin(key: Key, config: Config, **inputs: Output) -> tuple[Output, FitState]:
-        model, params = fit(config, **inputs).untrained(key)
-        return model, supervised.start(params, settings)
+        given = fit(config, **inputs)
+        model, params = given.untrained(key)
+        return model, supervised.start(params, given.problem(model))
 
     def advance(
         key: Key, config: Config, state: tuple[Output, FitState], **inputs: Output
@@ -133,7 +132,7 @@ def fit_stage(name: str, settings: FitConfig, fit: Callable[..., Fit]) -> Stage:
     def finish(config: Config, state: tuple[Output, FitState], **inputs: Output) -> Output:
         return fit(config, **inputs).trained(*state)
 
-    return Stage(name, begin, advance, finish, settings.steps, chunks)
+    return Stage(name, begin, advance, finish, steps, chunks)
 
 
 Start = tuple[Callable[[Key], Params], Problem[Any]]
@@ -153,7 +152,7 @@ def restarts(config: Config, start: Callable[..., Start]) -> list[Stage]:
         return Fit(lambda key: ((), init(key)), lambda _: problem, trained)
 
     number = config.jmvae.restarts
-    stage = fit_stage("", config.jmvae, fit)
+    stage = fit_stage("", config.jmvae.steps, fit)
     stage = dataclasses.replace(stage, shares="jmvae", is_optional=number > 1)
     return [dataclasses.replace(stage, name=f"jmvae_{i + 1}") for i in range(number)]
 

@@ -248,7 +248,7 @@ def problem(
         cost = -jnp.take_along_axis(found, of_looks[None], axis=0)[0]
         return cost[: len(of_shown)].mean() + cost[len(of_shown) :].mean()
 
-    return Problem(config, draw, loss)
+    return Problem(config.steps, config.learning_rate, draw, loss)
 
 
 def fitted(detector: Classifier, shown: Looks, nothing: Looks) -> Classifier:
@@ -337,8 +337,9 @@ def retrain(
         found = retrained(layer).of(jax.tree.map(lambda x: x[rows], shown))[:-1]
         return _cross_entropy(found, labels[rows])
 
-    start = supervised.start(layers[last], config)
-    fit, _ = supervised.fit(key, start, Problem(config, draw, loss), config.steps)
+    problem = Problem(config.steps, config.learning_rate, draw, loss)
+    start = supervised.start(layers[last], problem)
+    fit, _ = supervised.fit(key, start, problem, config.steps)
 
     def moved(share: jax.Array) -> Params:
         return jax.tree.map(lambda old, new: old + share * (new - old), layers[last], fit.params)

@@ -13,6 +13,7 @@ Log-likelihoods that are linear in the moments of the classes keep the weights a
 `readout` reads without error: a belief is a sufficient memory.
 """
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping
@@ -130,7 +131,7 @@ def decoding(
                 total += config.reconstruction_weights[m] * 0.5 * jnp.mean(squares)
         return total
 
-    return Problem(config, jmvae.problem(config, bank, model).draw, loss)
+    return dataclasses.replace(jmvae.problem(config, bank, model), loss=loss)
 
 
 @checks.typed
@@ -250,4 +251,4 @@ def filtering(config: FilterConfig, untrained: Filter, bank: Samples) -> Problem
         p, q = ((x.mean, 2 * jnp.log(x.std)) for x in (truth, beliefs))
         return jnp.mean(gaussian.kl_divergence(*p, *q))
 
-    return Problem(config, draw, loss)
+    return Problem(config.steps, config.learning_rate, draw, loss)

@@ -240,7 +240,7 @@ def problem(config: JmvaeConfig, bank: Samples, model: Jmvae) -> Problem[Drawn]:
         )
         return jnp.mean(total)
 
-    return Problem(config, draw, loss)
+    return Problem(config.steps, config.learning_rate, draw, loss)
 
 
 @checks.typed
@@ -268,13 +268,14 @@ def train(
     """
     require_32_bits()
     _require_bank(bank, model)
-    state = supervised.start(params, config)
+    fitted = problem(config, bank, model)
+    state = supervised.start(params, fitted)
     number = min(config.steps, 100)  # whose draws are in memory together
     chunks = -(-config.steps // number)
     keys = jax.random.split(key, chunks) if chunks > 1 else key[None]
 
     def chunk(state: supervised.FitState, key: Key) -> tuple[supervised.FitState, jax.Array]:
-        return supervised.fit(key, state, problem(config, bank, model), number)
+        return supervised.fit(key, state, fitted, number)
 
     state, losses = jax.lax.scan(chunk, state, keys)
     checks.require_finite("losses", losses, _CONVERGES)

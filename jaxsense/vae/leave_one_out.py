@@ -167,7 +167,7 @@ def problem(config: JmvaeConfig, groups: Groups, model: Jmvae) -> Problem[Drawn]
         )
         return jnp.mean(of_each)
 
-    return Problem(config, draw, loss)
+    return Problem(config.steps, config.learning_rate, draw, loss)
 
 
 @pytree

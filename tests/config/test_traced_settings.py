@@ -50,7 +50,7 @@ def learn(config):
     detector = detectors.init(keys[1], windows, 2, config.detector)
     looks = detectors.Looks(windows, jnp.ones(12))
     problem = detectors.problem(config.detector, detector, looks, jnp.arange(12) % 2, looks)
-    state = supervised.start(detector.params, config.detector)
+    state = supervised.start(detector.params, problem)
     fit, _ = supervised.fit(keys[2], state, problem, config.detector.steps)
 
     model = make_jmvae(config)

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -23,10 +22,6 @@ class Given:
     steps: int
     learning_rate: float = 0.1
 
-    @property
-    def config(self):
-        return SimpleNamespace(steps=self.steps, learning_rate=self.learning_rate)
-
     def draw(self, key, number):
         del key
         return jnp.array(self.batches)[:number]
@@ -36,8 +31,7 @@ def fit(state, problem):
     return supervised.fit(KEY, state, problem, len(problem.batches))
 
 
-def start(params, problem):
-    return supervised.start(params, problem.config)
+start = supervised.start
 
 
 def square(params, batch, step):

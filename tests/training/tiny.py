@@ -26,7 +26,8 @@ TINY = dataclasses.replace(
 
 def given_problem(config, detector, shown, labels, nothing):
     """In place of `detectors.problem`: what a detector is fitted to."""
-    return SimpleNamespace(shown=shown, labels=labels, nothing=nothing)
+    looks = {"shown": shown, "labels": labels, "nothing": nothing}
+    return SimpleNamespace(steps=config.steps, learning_rate=config.learning_rate, **looks)
 
 
 def sources_of(config):

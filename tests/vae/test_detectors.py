@@ -49,7 +49,7 @@ def problem():
 @pytest.fixture(scope="module")
 def trained(problem):
     """A detector, and the losses of its training."""
-    start = supervised.start(problem.detector.params, CONFIG)
+    start = supervised.start(problem.detector.params, problem.fit)
     fit = jax.jit(lambda key, state: supervised.fit(key, state, problem.fit, CONFIG.steps))
     state, losses = fit(jax.random.key(2), start)
     found = replace(problem.detector, params=state.params)

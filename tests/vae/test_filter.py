@@ -83,7 +83,7 @@ def trained():
     found = untrained_filter((16,))
     problem = fusion.filtering(TRAINED, found, bank(jax.random.key(2), 4000))
     train = jax.jit(lambda key, state: supervised.fit(key, state, problem, 300))
-    state, losses = supervised.start(found.networks, TRAINED), []
+    state, losses = supervised.start(found.networks, problem), []
     for i in range(2):
         state, loss = train(jax.random.key(3 + i), state)
         losses.append(loss)
