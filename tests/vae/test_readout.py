@@ -37,6 +37,13 @@ def test_a_prior_may_be_of_any_class_however_wide_it_is(variance):
     np.testing.assert_allclose(read(rounded, prior), 1 / 3, atol=1e-6)
 
 
+def test_labels_leave_as_many_directions_as_they_have_less_one_each():
+    rng = np.random.default_rng(0)
+    classes = Belief(jnp.array(rng.normal(size=(6, 5))), jnp.array(rng.uniform(0.2, 0.6, (6, 5))))
+    directions = lambda *numbers: readout.make(classes, numbers or None).whitening.shape[1]  # noqa: E731
+    assert [directions(), directions(3, 2), directions(2), directions(9)] == [5, 3, 1, 5]
+
+
 def test_a_belief_that_is_only_near_the_prior_is_read_by_its_moments():
     # A prior with the moments of a mixture of 1 to 4 to 4, which it would read as if it were one.
     shares = np.array([1, 4, 4]) / 9
