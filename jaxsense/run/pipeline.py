@@ -196,8 +196,11 @@ class _Training:
             output = stage.finish(self.programs.config, self._begin(stage, given), **given)
             # Joined rows lie on the host, and every program would transfer them again.
             output = jax.device_put(output)
-        if not (stage.is_optional or is_finite(output)):
-            raise StageError(f"{stage.name}: results are not finite")
+        if not is_finite(output):
+            told = f"{stage.name}: results are not finite"
+            if not stage.is_optional:
+                raise StageError(told)
+            self.programs.monitor.warn(f"{told}: left out")
         return output
 
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
@@ -217,15 +220,8 @@ class _Training:
             seconds = np.array([time.perf_counter() - begin])
             return state, {**self._report(stage, chunk, progress), "seconds": seconds}
 
-        try:
-            # Nobody but `_run_chunks` holds the first state, so that it can let go of it.
-            state = self._run_chunks(stage, self._begin(stage, inputs), advance)
-        except StageError as error:
-            if not stage.is_optional:
-                raise
-            self.programs.monitor.warn(f"{error}: left out")
-            self.curves[stage.name] = self._no_curves(stage)
-            return _failed(programs.output)
+        # Nobody but `_run_chunks` holds the first state, so that it can let go of it.
+        state = self._run_chunks(stage, self._begin(stage, inputs), advance)
         return programs.finish(config, state, inputs)
 
     def _run_chunks(
@@ -284,7 +280,7 @@ class _Training:
             lambda x: np.asarray(x)[: done - chunk * size], (progress.loss, progress.metrics)
         )
         bad = np.flatnonzero(~np.isfinite(losses))
-        if len(bad):
+        if len(bad) and not stage.is_optional:
             where = f"at step {chunk * size + bad[0] + 1} of {stage.steps}"
             raise StageError(f"{stage.name}: loss = {losses[bad[0]]} {where}")
         means = {
@@ -306,16 +302,7 @@ class _Training:
         return self.checkpoints.load_or_forget(stage.name, output, not stage.is_optional)
 
     def _no_curves(self, stage: Stage) -> Curves:
-        """The curves of a training that has not begun, or has failed."""
+        """The curves of a training that has not begun."""
         lengths = dict.fromkeys(self.programs.of(stage).metrics, stage.steps)
         lengths["seconds"] = stage.chunks
         return {name: np.full(length, np.nan, np.float32) for name, length in lengths.items()}
-
-
-def _failed(shapes: Output) -> Output:
-    """The output of a failed training: every float is NaN, everything else 0."""
-
-    def fail(x: jax.ShapeDtypeStruct) -> np.ndarray:
-        return np.full(x.shape, np.nan if np.issubdtype(x.dtype, np.floating) else 0, x.dtype)
-
-    return jax.tree.map(fail, shapes)
