@@ -162,7 +162,7 @@ def compiled(
     """
     if workers.mesh is not None:
         alone = trace(function, devices.share(shapes_of(args), workers.mesh))
-        function = devices.spread(alone.__call__, workers.mesh)
+        function = devices.spread(alone.__call__, workers.mesh, len(args))
         args = jax.device_put(args, NamedSharding(workers.mesh, PartitionSpec(devices.AXIS)))
     # A single worker also takes what has no rows, such as a key.
     rows = len(jax.tree.leaves(args)[0]) if workers.threads > 1 else 1

@@ -187,14 +187,11 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
 def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission.Case]:
     """The cases to play; raises `ConfigError` for an unknown policy."""
     cases = mission.cases(scenario.config, scenario.policies)
-    if arguments.policy == "all":
-        return cases
-    if arguments.policy == "policies":
-        return {name: cases[name] for name in scenario.policies}
-    if arguments.policy not in cases:
-        known = ", ".join(["all", "policies", *cases])
-        raise ConfigError("policy", arguments.policy, f"must be one of {known}")
-    return {arguments.policy: cases[arguments.policy]}
+    known = {"all": cases, "policies": {name: cases[name] for name in scenario.policies}}
+    known |= {name: {name: case} for name, case in cases.items()}
+    if arguments.policy not in known:
+        raise ConfigError("policy", arguments.policy, f"must be one of {', '.join(known)}")
+    return known[arguments.policy]
 
 
 def _print(missions: blocks.Missions, episodes: int) -> None:

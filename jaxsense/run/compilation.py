@@ -254,7 +254,7 @@ class Program:
         except NotImplementedError as error:
             reason = f"must be 1: {self._stage} cannot be split ({error})"
             raise ConfigError("devices", mesh.size, reason) from error
-        spread = devices.spread(traced.__call__, mesh, whole)
+        spread = devices.spread(traced.__call__, mesh, len(args), whole)
         self._places = devices.places(mesh, len(args), whole)
         return jax.jit(spread, in_shardings=self._places).lower(*shapes)
 

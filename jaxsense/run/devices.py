@@ -191,7 +191,9 @@ def fetched(values: PyTree[jax.Array]) -> PyTree[np.ndarray]:
     return jax.device_get(values)
 
 
-def spread(function: Callable[..., PyTree], mesh: Mesh, whole: int = 0) -> Callable[..., PyTree]:
+def spread(
+    function: Callable[..., PyTree], mesh: Mesh, number: int, whole: int = 0
+) -> Callable[..., PyTree]:
     """Calls a function on each device with a part of its rows, independent of the other devices.
 
     Args:
@@ -199,24 +201,16 @@ def spread(function: Callable[..., PyTree], mesh: Mesh, whole: int = 0) -> Calla
         inside, it must be one that `compilation.trace` returns: jaxlib 0.11.2 crashes while it
         compiles a step of MJX whose constants `shard_map` sees, on a CPU and on accelerators.
       mesh: from `make_mesh`; its size must divide the batch.
+      number: of arguments.
       whole: number of arguments, the first ones, that every device gets undivided.
 
     Returns:
       The same function; call it under `jit`.
     """
-
-    def partitioned(*args: PyTree) -> PyTree:
-        # The rows of devices are different, which nobody needs to check.
-        split = jax.shard_map(
-            function,
-            mesh=mesh,
-            in_specs=tuple(place.spec for place in places(mesh, len(args), whole)),
-            out_specs=PartitionSpec(AXIS),
-            check_vma=False,
-        )
-        return split(*args)
-
-    return partitioned
+    divided = PartitionSpec(AXIS)
+    specs = tuple(place.spec for place in places(mesh, number, whole))
+    # The rows of devices are different, which nobody needs to check.
+    return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=divided, check_vma=False)
 
 
 def side_by_side(

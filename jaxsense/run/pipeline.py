@@ -98,7 +98,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
         },
         results={
             "detectors": make.plain(measured),
-            "jmvae": make.jmvae(latent | grouped),
+            "jmvae": make.plain(latent | grouped),
             "belief": beliefs,
             "dqn": {
                 name: agent(name, values)

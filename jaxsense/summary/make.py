@@ -13,19 +13,10 @@ from jaxsense.summary.blocks import Case, Missions
 from jaxsense.summary.compare import REFERENCE, Measured, differences
 from jaxsense.training.comparison import permutations
 
-_UNAMBIGUOUS = 0.9  # share of looks that leave only the class; above, the class is unambiguous
 _AS_GOOD = 0.01  # tolerance of the reward below the optimum
 _ERROR = 0.01  # of the optimum, as a share of it
 
 _Rewards = Mapping[str, tuple[np.ndarray, np.ndarray]]
-
-
-def jmvae(measured: Mapping[str, object]) -> blocks.Jmvae:
-    """The block `jmvae` from arrays under its keys, with shares of looks under `unambiguous`."""
-    block: blocks.Jmvae = plain(dict(measured))
-    for name, shares in block["unambiguous"].items():
-        block["unambiguous"][name] = [share > _UNAMBIGUOUS for share in shares]
-    return block
 
 
 def plain(measured: PyTree) -> PyTree:

@@ -21,6 +21,7 @@ _LOOKS = 6  # in a history of looks at one PoI
 _HISTORIES = 1024  # to measure what a readout loses
 _HISTORIES_AT_ONCE = 512
 _ACTIVE_VARIANCE = 0.01
+_UNAMBIGUOUS = 0.9  # share of looks that leave only the true class
 
 
 def detector_metrics(
@@ -85,8 +86,9 @@ def latent_space(
 
     Returns:
       `[C, S, D]` beliefs for `joint` and for each modality alone, and metrics of them: `[C]` means
-      of `sigma_norm`, and `[C]` shares of looks after which only the true class is plausible
-      (`unambiguous`), or just those that the sensor cannot distinguish from it (`consistent`);
+      of `sigma_norm`, `[C]` whether after most looks only the true class is plausible
+      (`unambiguous`), and shares of looks after which just those are that the sensor cannot
+      distinguish from it (`consistent`);
       the others are `[]`.
     """
     bank, class_means = detections.held_out, fusion.classes.mean
@@ -110,7 +112,7 @@ def latent_space(
     return found, {
         "active_units": active_units(joint.mean.reshape(-1, joint.mean.shape[-1])),
         "sigma_norm": {n: readout.sigma_norm(b.std).mean(axis=1) for n, b in found.items()},
-        "unambiguous": {n: share(x, same) for n, x in open_classes.items()},
+        "unambiguous": {n: share(x, same) > _UNAMBIGUOUS for n, x in open_classes.items()},
         "consistent": {n: share(x, consistent[n]) for n, x in open_classes.items()},
         "moment_matching_error": _mean_error(joint, alone, config),
         "readout_error": readout_error(key, config, bank, fusion.classes, read),

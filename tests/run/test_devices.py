@@ -31,7 +31,7 @@ def test_a_spread_function_gives_what_it_gives_alone():
         return {"sum": x.sum(axis=1) * scale, "x": x}
 
     x = jnp.arange(12.0).reshape(6, 2)
-    spread = jax.jit(devices.spread(lambda scale, x: function(x, scale), mesh, whole=1))
+    spread = jax.jit(devices.spread(lambda scale, x: function(x, scale), mesh, 2, whole=1))
     chex.assert_trees_all_close(spread(jnp.float32(3), x), function(x, jnp.float32(3)))
     assert spread(jnp.float32(3), x)["sum"].sharding.num_devices == 2
 
@@ -49,7 +49,7 @@ SPEEDS = np.arange(16.0, dtype=np.float32).reshape(4, 2, 2)
 def test_a_step_of_the_physics_is_spread_over_two_host_devices():
     # If `shard_map` saw its constants, jaxlib 0.11.2 would crash while it compiles this.
     alone = trace(drive, (SPEEDS[:2],))
-    together = jax.jit(devices.spread(alone, devices.make_mesh(2)))(SPEEDS)
+    together = jax.jit(devices.spread(alone.__call__, devices.make_mesh(2), 1))(SPEEDS)
     assert together.sharding.num_devices == 2
     np.testing.assert_allclose(together, jax.jit(drive)(SPEEDS), rtol=1e-5)
 

@@ -1,6 +1,5 @@
 """The blocks of a summary, from made-up arrays."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from summaries import FOUND
@@ -12,14 +11,6 @@ from jaxsense.summary import make
 
 CONFIG = PRESETS["smoke"]
 RETURNS = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal"
-
-
-def test_more_than_nine_of_ten_looks_make_a_class_unambiguous():
-    measured = {"active_units": jnp.int32(2), "fusion": {"accuracy": None}}
-    measured["unambiguous"] = {"joint": jnp.array([0.9, 0.91, 1.0])}
-    block = make.jmvae(measured)
-    assert block["unambiguous"] == {"joint": [False, True, True]}
-    assert (block["active_units"], block["fusion"]) == (2, {"accuracy": None})
 
 
 # Two PoIs of two classes and one sensor: 2^2 x 2^2 states, of which half hold both classes.
