@@ -15,9 +15,9 @@ from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
 from jaxsense.run.settings import MAX_SEED
-from jaxsense.show import film, page, tables
+from jaxsense.show import film, page
 from jaxsense.show.terminal import Display
-from jaxsense.summary import make
+from jaxsense.summary import make, tables
 from jaxsense.tasks import PRETRAINED, load_pretrained
 
 PROGRAM = "jaxsense.demo"

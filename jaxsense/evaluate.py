@@ -18,9 +18,9 @@ from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
 from jaxsense.run.programs import OwnPolicies
 from jaxsense.run.settings import MAX_SEED
-from jaxsense.show import drawing, film, page, plots, tables
+from jaxsense.show import drawing, film, page, plots
 from jaxsense.show.terminal import Display
-from jaxsense.summary import blocks, compare, make
+from jaxsense.summary import blocks, compare, make, tables
 from jaxsense.summary.blocks import policies as policies_of
 from jaxsense.summary.read import EVALUATIONS, read_evaluations, read_summary
 

@@ -6,7 +6,7 @@ from jaxsense import tasks
 from jaxsense.config.section import Checked
 from jaxsense.run import cli, devices, output
 from jaxsense.run.output import tell
-from jaxsense.show.tables import Table
+from jaxsense.summary.tables import Table
 from jaxsense.tasks import Task
 from jaxsense.tasks.registry import TASKS, agents
 from jaxsense.tasks.score import estimate

@@ -29,9 +29,9 @@ from jaxsense.run.output import on_interrupt, say
 from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
-from jaxsense.show import tables, terminal
+from jaxsense.show import terminal
 from jaxsense.show.terminal import Display
-from jaxsense.summary import blocks, compare
+from jaxsense.summary import blocks, compare, tables
 from jaxsense.summary.blocks import Header, Origin
 from jaxsense.summary.read import read_origins, read_summary
 

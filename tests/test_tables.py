@@ -7,8 +7,8 @@ import pytest
 import rich.console
 from summaries import CASE, SUMMARY
 
-from jaxsense.show import tables
 from jaxsense.show.terminal import Display
+from jaxsense.summary import tables
 from jaxsense.summary.blocks import MISSIONS
 
 

@@ -22,6 +22,7 @@ from jaxsense.run.settings import MAX_SEED
 from jaxsense.summary import make
 from jaxsense.summary.blocks import MISSIONS, Case
 from jaxsense.summary.compare import REFERENCE
+from jaxsense.summary.tables import of_metrics
 
 _IS_POLICY = "must be a function (key, models, known) -> values that JAX can trace"
 AGAINST = (REFERENCE, "auction", "naive", "random")
@@ -62,18 +63,9 @@ class MissionScore:
     episodes: int
 
     def __str__(self):
-        metrics = [MISSIONS[key] for key in ("accuracy", "observations_per_poi", "mean_time_s")]
-        difference = MISSIONS["intervals.time_s"]
-        against = f"difference from {self.reference} [s]"
-        rows = [["", *(metric.label for metric in metrics), against]]
-        for name, case in self.policies.items():
-            rows.append([name, *(metric.text(case) for metric in (*metrics, difference))])
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = [f"missions of each policy, in the same arenas: {self.episodes:,}"]
-        for name, *values in rows:
-            cells = [value.rjust(w) for value, w in zip(values, widths[1:], strict=True)]
-            lines.append("  ".join([name.ljust(widths[0]), *cells]))
-        return "\n  ".join(lines)
+        keys = "accuracy", "observations_per_poi", "mean_time_s", "intervals.time_s"
+        caption = f"{self.episodes:,} missions of each policy; differences from {self.reference}"
+        return str(of_metrics(caption, self.policies, [MISSIONS[key] for key in keys]))
 
 
 @checks.typed

@@ -16,8 +16,7 @@ from markupsafe import Markup
 from jaxsense.config import PRESETS, Config, as_plain
 from jaxsense.config.options import command, flat
 from jaxsense.core import inside
-from jaxsense.show import tables
-from jaxsense.summary import compare
+from jaxsense.summary import compare, tables
 from jaxsense.summary.blocks import Evaluation, Missions, Summary, mean
 from jaxsense.summary.read import EVALUATIONS
 

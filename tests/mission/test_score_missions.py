@@ -73,10 +73,10 @@ def test_differences_are_of_the_same_arenas(play):
     assert mine["intervals"]["time_s"]["high"] == pytest.approx(2 + 3.182 * 2**0.5 / 2, abs=1e-3)
     assert "intervals" not in found.policies["naive"]
     assert str(found).splitlines() == [
-        "missions of each policy, in the same arenas: 4",
-        "         right  looks per PoI  mean time [s]  difference from naive [s]",
-        "  mine   0.750           2.50           15.0          2.0 (-0.3\u00a0to\u00a04.3)",
-        "  naive  1.000           2.00           13.0                          -",
+        "4 missions of each policy; differences from naive",
+        "       right  looks per PoI  mean time [s]  mean time, difference [s]",
+        "mine   0.750           2.50           15.0          2.0 (-0.3\u00a0to\u00a04.3)",
+        "naive  1.000           2.00           13.0                          -",
     ]
 
 

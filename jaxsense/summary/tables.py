@@ -49,7 +49,7 @@ class Table:
         return "\n".join([self.caption, *map("  ".join, rows), ""])
 
 
-def _table(
+def of_metrics(
     caption: str, blocks: Mapping[str, Mapping[str, object]], metrics: Iterable[Metric]
 ) -> Table:
     """A row for each block that has one of the metrics, a column for each that one of them has."""
@@ -65,14 +65,14 @@ def _table(
 
 def detectors(results: Results) -> Table:
     """The detectors, on scans of scenes that they were not trained on."""
-    return _table("Detectors", results["detectors"], DETECTORS.values())
+    return of_metrics("Detectors", results["detectors"], DETECTORS.values())
 
 
 def agents(results: Results) -> Table:
     """The Q-networks compared with other policies on the map."""
     keys = "return", "optimal", "greedy", "naive", "random", "fraction_of_optimal", "optimal_states"
     metrics = [AGENTS[key] for key in (*keys, "num_states")]
-    return _table("Policies of a robot alone on the map: mean reward", results["dqn"], metrics)
+    return of_metrics("Policies of a robot alone on the map: mean reward", results["dqn"], metrics)
 
 
 def latent_space(results: Results) -> Table:
@@ -80,7 +80,7 @@ def latent_space(results: Results) -> Table:
     per_class = "sigma_norm", "unambiguous", "consistent"
     metrics = [metric for key, metric in JMVAE.items() if key not in per_class]
     block = {**results["jmvae"], **results["belief"]}
-    return _table("Latent space", {"here": block}, [*metrics, BELIEF["doubt_correlation"]])
+    return of_metrics("Latent space", {"here": block}, [*metrics, BELIEF["doubt_correlation"]])
 
 
 def unambiguous(results: Results, classes: tuple[str, ...]) -> Table:
@@ -129,7 +129,7 @@ _UNFINISHED = (
 
 def _missions(played: Mapping[str, Case], caption: str) -> Table:
     keys = "accuracy", "observations_per_poi", "time_s", "collisions"
-    table = _table(caption, played, [MISSIONS[key] for key in keys])
+    table = of_metrics(caption, played, [MISSIONS[key] for key in keys])
     rows = []
     for (name, texts), case in zip(table.rows, played.values(), strict=True):
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
@@ -150,7 +150,7 @@ def all_of_missions(block: Missions) -> list[Table]:
     for key, metric in MISSIONS.items():
         if key not in ("seed", "ended"):
             groups[_CAPTIONS[key.rpartition(".")[0]]].append(metric)
-    found = [_table(caption, block, metrics) for caption, metrics in groups.items()]
+    found = [of_metrics(caption, block, metrics) for caption, metrics in groups.items()]
     return [table for table in found if table.rows]
 
 
@@ -166,8 +166,8 @@ def times(results: Results, timing: Timing) -> list[Table]:
     """The time of each stage, in order, and the speed of Q-learning."""
     speed = AGENTS["env_steps"], AGENTS["env_steps_per_s"]
     return [
-        _table("Stages, which compile and run side by side", timing["stages"], STAGES.values()),
-        _table("Training of the Q-networks", results["dqn"], speed),
+        of_metrics("Stages, which compile and run side by side", timing["stages"], STAGES.values()),
+        of_metrics("Training of the Q-networks", results["dqn"], speed),
     ]
 
 
