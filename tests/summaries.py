@@ -49,8 +49,6 @@ OF_SEEDS = {
     "failed": {"90211": "jmvae: loss at step 1 of 2 is not finite"},
 }
 OF_A_TEAM = {**SUMMARY, "dqn": {"camera": {**AGENT, "other_numbers": {"8": RETURNS}}}}
-GROUPED = {"pair": 0.9995, "all_looks": 1.0}
-OF_SCANS = {**SUMMARY, "jmvae": {**SUMMARY["jmvae"], "grouped": GROUPED}}
 ORIGIN = {
     "versions": {"python": "3.12.3", "jax": "0.11.2", "mujoco": "3.17.0"},
     "devices": ["NVIDIA H200"],

@@ -112,8 +112,6 @@ def test_paper_preset(paper):
 def test_raw_preset(default, seed, tmp_path, summary_of):
     raw = summary_of("raw", seed, tmp_path / "raw")
     latent = raw["jmvae"]
-    assert latent["grouped"]["pair"] >= 0.995
-    assert latent["grouped"]["all_looks"] >= 0.999
     assert latent["unambiguous"] == TABLE_1
     assert min(min(shares) for shares in latent["consistent"].values()) >= 0.95
     assert latent["active_units"] == 2

@@ -25,7 +25,7 @@ def snippets(page):
 
 
 PROGRAM, CLASSES, ATTRIBUTE, SENSOR, SETTINGS, *_ = snippets("docs/extending.md")
-PLAYED, RESAMPLED, LOOKS, _, RETRAINED, ARCHIVED = snippets("docs/robot.md")
+PLAYED, RESAMPLED, LOOKS, RETRAINED, ARCHIVED = snippets("docs/robot.md")
 INTERFACES = snippets("docs/interfaces.md")
 
 

@@ -72,8 +72,6 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
     detections = jax.tree.map(np.asarray, outputs["detections"])
     beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
     is_sound = compare.unsound(beliefs) is None
-    # Measured of a JMVAE that learns from scans, and of no other.
-    grouped = {name: x for name, x in outputs.items() if name == "grouped"}
 
     def agent(modality: str, values: Output) -> blocks.Agent:
         names = f"policies_{modality}", f"numbers_{modality}"
@@ -98,7 +96,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
         },
         results={
             "detectors": make.plain(measured),
-            "jmvae": make.plain(latent | grouped),
+            "jmvae": make.plain(latent),
             "belief": beliefs,
             "dqn": {
                 name: agent(name, values)

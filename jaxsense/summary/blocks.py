@@ -105,13 +105,6 @@ class Fusion(TypedDict):
     std_error: Annotated[Maybe, Metric("fusion: error of sigma", "Log-ratio to the joint one.")]
 
 
-class Grouped(TypedDict):
-    """`jmvae.grouped`: joint posteriors of a JMVAE that learns from scans, at held-out PoIs."""
-
-    pair: Annotated[float, Metric("right, one look each", "Share nearest to its cluster.", 4)]
-    all_looks: Annotated[float, Metric("right, all looks", "After four looks each.", 4)]
-
-
 class Jmvae(TypedDict):
     """`jmvae`: the latent space."""
 
@@ -125,7 +118,6 @@ class Jmvae(TypedDict):
     moment_matching_error: Annotated[float, Metric("error of moments", "From the best Gaussian.")]
     readout_error: Annotated[float, Metric("error of the readout", "Nats lost by storing.", 4)]
     fusion: Fusion
-    grouped: NotRequired[Grouped]
 
 
 class Beliefs(TypedDict):

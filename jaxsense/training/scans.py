@@ -128,43 +128,13 @@ def shown(
     def of_scenes(survey: Survey) -> jax.Array:
         if not len(survey.classes):
             return survey.classes
-        of_groups = _shown(config, params, views, classes, survey)
-        of_groups = of_groups.reshape(-1, config.arena.num_pois)
-        return jnp.repeat(of_groups, config.jmvae.num_together, axis=0)
+        groups = tuple(
+            jax.lax.map(jax.vmap(scaling), grouped(x, config), batch_size=512)
+            for scaling, x in zip(views.scalings, survey.windows, strict=True)
+        )
+        found = leave_one_out.nearest(_posteriors(params, config, groups).mean, classes.mean)
+        classes_shown = found.reshape(-1, config.arena.num_pois)
+        return jnp.repeat(classes_shown, config.jmvae.num_together, axis=0)
 
     calibrating = surveys.training.of_scenes(slice(_num_scenes(config), None))
     return Shown(of_scenes(calibrating), of_scenes(surveys.bank))
-
-
-def _shown(
-    config: Config,
-    params: Params,
-    views: Views,
-    classes: Belief,
-    survey: Survey,
-    first: int | None = None,
-) -> jax.Array:
-    """`[P]` int32 classes that the first looks by each sensor, or all, show together."""
-    groups = tuple(
-        jax.lax.map(jax.vmap(scaling), grouped(x, config)[:, :first], batch_size=512)
-        for scaling, x in zip(views.scalings, survey.windows, strict=True)
-    )
-    return leave_one_out.nearest(_posteriors(params, config, groups).mean, classes.mean)
-
-
-def accuracies(
-    key: Key, config: Config, *, surveys: Surveys, params: Params, views: Views, classes: Belief
-) -> dict[str, Float[Array, ""]]:
-    """Share of held-out PoIs whose joint posterior is nearest to the true class.
-
-    Returns:
-      `pair` after one look by each sensor, and `all_looks` after four by each.
-    """
-    del key
-    truth = surveys.held_out.classes[:: config.jmvae.num_together].reshape(-1)
-
-    def share(first: int | None) -> jax.Array:
-        shown = _shown(config, params, views, classes, surveys.held_out, first)
-        return jnp.mean(shown == truth)
-
-    return {"pair": share(1), "all_looks": share(None)}

@@ -117,7 +117,6 @@ def _learn_from_scans(
     trained = tuple(drive(stage, examples=examples, shown=shown, **learned) for stage in stages)
     find = Stage("detections", detections.detect)
     detected = drive(find, surveys=surveys, trained=trained, shown=shown)
-    drive(Stage("grouped", scans.accuracies), **learned)
     return trained, params, classes, detected, {"shown": shown}
 
 

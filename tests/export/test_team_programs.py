@@ -11,6 +11,7 @@ import pytest
 from exporting import CONFIG, EXAMPLE, drawn
 from untrained import untrained
 
+import jaxsense
 from jaxsense import export
 from jaxsense.config import PRESETS
 from jaxsense.config.mission import CommunicationConfig
@@ -42,7 +43,7 @@ def team():
     """Models of a team, and their archive."""
     dqn = dataclasses.replace(PRESETS["team"].dqn, hidden=(8,))
     config = dataclasses.replace(CONFIG, dqn=dqn, robots=("camera", "lidar", "lidar"))
-    trained = untrained(config)
+    trained = jaxsense.init(jax.random.key(1), config)  # whose network looks
     return trained, load(io.BytesIO(export.archive(config, trained)))
 
 

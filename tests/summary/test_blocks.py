@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from summaries import CASE, EVALUATION, OF_A_TEAM, OF_SCANS, OF_SEEDS, ORIGIN, SUMMARY
+from summaries import CASE, EVALUATION, OF_A_TEAM, OF_SEEDS, ORIGIN, SUMMARY
 
 from jaxsense.summary import blocks
 from jaxsense.summary.blocks import BLOCKS
@@ -11,7 +11,6 @@ from jaxsense.summary.blocks import BLOCKS
 KEYS = {place + key for place, block in BLOCKS.items() for key in block}
 # Only in some runs: of several seeds, of a team, from scans, or of one robot alone.
 RARE = {"commit", "origins", "seeds", "failed", "dqn.MODALITY.other_numbers", "mission.POLICY.seed"}
-RARE |= {"jmvae.grouped.pair", "jmvae.grouped.all_looks"}
 RARE |= {f"mission.POLICY.{key}" for key in ("told", "ambiguous_reported")}
 RARE |= {f"evaluations.NAME.{key}" for key in ("num_pois", "side", "robots")}
 RARE |= {f"evaluations.NAME.origin.{key}" for key in ORIGIN}
@@ -39,7 +38,7 @@ def test_a_real_summary_has_every_documented_key_and_no_other(smoke_run):
 def test_every_rare_key_is_somewhere():
     alone = {**CASE, "seed": 7, "told": 1.0, "ambiguous_reported": None}
     evaluation = {**EVALUATION, "mission": {"camera_alone": alone}}
-    found = keys(OF_SEEDS) | keys(OF_A_TEAM) | keys(OF_SCANS)
+    found = keys(OF_SEEDS) | keys(OF_A_TEAM)
     found |= {"commit", "origins"} | {
         key if key in KEYS else f"evaluations.NAME.{key}" for key in keys(evaluation)
     }
