@@ -31,6 +31,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from jaxsense.core.checks import shown
 from jaxsense.core.types import register
 
 T = TypeVar("T")
@@ -41,32 +42,17 @@ _LEAF = "leaf"
 Traced = Annotated[T, _LEAF]
 """A setting that only enters the arithmetic: a number, or a JAX array, traced or not."""
 
-_MAX_SHOWN = 200  # characters of a value
-
 
 class ConfigError(ValueError):
     """Raised for an invalid setting; its message is `field = value: what would be right`."""
 
     def __init__(self, field: str, value: object, expected: str):
-        text = f"{field} = {_shown(value)}: {expected}"
+        text = f"{field} = {shown(value)}: {expected}"
         # It may quote a file, whose control characters a terminal would obey.
         super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in text))
 
     def __reduce__(self):
         return type(self).__new__, (type(self), *self.args)
-
-
-def _shown(value: object) -> str:
-    """A value in one short line; a function by its name."""
-    while isinstance(value, functools.partial):
-        value = value.func
-    if callable(value):
-        return getattr(value, "__name__", type(value).__name__)
-    try:
-        text = " ".join(line.strip() for line in repr(value).splitlines())
-    except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits
-        return f"a huge {type(value).__name__}"
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 
 
 class FrozenDict(dict[K, V]):

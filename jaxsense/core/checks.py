@@ -22,7 +22,7 @@ from jaxsense.core.types import Belief
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_MOST_SHOWN = 80  # characters of a value
+_MOST_SHOWN = 200  # characters of a value
 _ARRAYS = jax.Array | np.ndarray | np.generic | float | int
 _Shape = Sequence[int | EllipsisType | None]
 
@@ -35,17 +35,23 @@ def require(
         return
     values = np.asarray(value)
     if values.dtype.kind in "OSUc":
-        raise ValueError(f"{name} = {_shown(value)}: {expected}")
+        raise ValueError(f"{name} = {shown(value)}: {expected}")
     wrong = values[~np.asarray(is_right(values))]
     if wrong.size:
         raise ValueError(f"{name} = {wrong.flat[0]}: {expected}")
 
 
-def _shown(value: object) -> str:
-    """A value in one line, which is cut where it is long."""
-    is_tree = dataclasses.is_dataclass(value) and not isinstance(value, type)
-    text = type(value).__name__ if is_tree else " ".join(repr(value).split())
-    return text if len(text) <= _MOST_SHOWN else f"{text[: _MOST_SHOWN - 3]}..."
+def shown(value: object) -> str:
+    """A value in one short line; a function by its name, a dataclass by that of its class."""
+    while isinstance(value, functools.partial):
+        value = value.func
+    if not isinstance(value, type) and (callable(value) or dataclasses.is_dataclass(value)):
+        return getattr(value, "__name__", type(value).__name__)
+    try:
+        text = " ".join(repr(value).split())
+    except (RecursionError, ValueError):  # a thousand levels, or more than 4300 digits
+        return f"a huge {type(value).__name__}"
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}..."
 
 
 def require_positive(name: str, value: object) -> None:
@@ -70,7 +76,7 @@ def require_shape(name: str, value: object, shape: _Shape) -> None:
     """An array has a shape: None for an axis of any size, `...` at either end for any axes."""
     expected = str(tuple(shape)).replace("None", "any").replace("Ellipsis", "...")
     if not isinstance(value, _ARRAYS):
-        raise ValueError(f"{name} = {_shown(value)}: must be an array of shape {expected}")
+        raise ValueError(f"{name} = {shown(value)}: must be an array of shape {expected}")
     try:
         chex.assert_shape(value, tuple(shape))
     except AssertionError:
@@ -82,7 +88,7 @@ def require_key(key: object) -> None:
     """A value is one random key, of `jax.random.key` or of the older `jax.random.PRNGKey`."""
     expected = "must be one key, as from jax.random.key"
     if not isinstance(key, jax.Array | np.ndarray):
-        raise ValueError(f"key = {_shown(key)}: {expected}(0)")
+        raise ValueError(f"key = {shown(key)}: {expected}(0)")
     is_key = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     if not is_key and (key.dtype != jnp.uint32 or key.ndim == 0):
         raise ValueError(f"key of {key.dtype}{[*key.shape]}: {expected}(0)")
@@ -104,19 +110,19 @@ def require_modality(modality: object, modalities: Sequence[str]) -> None:
     """A modality is an index; the error lists the indices with their names."""
     if isinstance(modality, bool | float) or modality not in range(len(modalities)):
         expected = " or ".join(f"{m} ({name})" for m, name in enumerate(modalities))
-        raise ValueError(f"modality = {_shown(modality)}: must be {expected}")
+        raise ValueError(f"modality = {shown(modality)}: must be {expected}")
 
 
 def require_number(name: str, value: object) -> None:
     """A value is one whole number greater than 0."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"{name} = {_shown(value)}: must be a whole number greater than 0")
+        raise ValueError(f"{name} = {shown(value)}: must be a whole number greater than 0")
 
 
 def require_type(name: str, value: object, kind: type, source: str) -> None:
     """A value is of a class; `source` says where such values come from."""
     if not isinstance(value, kind):
-        raise ValueError(f"{name} = {_shown(value)}: must be {kind.__name__}, {source}")
+        raise ValueError(f"{name} = {shown(value)}: must be {kind.__name__}, {source}")
 
 
 def typed(function: Callable[P, T]) -> Callable[P, T]:
@@ -162,6 +168,6 @@ def require_one_each(name: str, values: object, modalities: Sequence[str]) -> No
     """Each modality has one value."""
     expected = f"{len(modalities)}, one for each of {tuple(modalities)}"
     if not isinstance(values, Sequence | jax.Array | np.ndarray) or isinstance(values, str):
-        raise ValueError(f"{name} = {_shown(values)}: must hold {expected}")
+        raise ValueError(f"{name} = {shown(values)}: must hold {expected}")
     if len(values) != len(modalities):
         raise ValueError(f"{name} has {len(values)} entries: must be {expected}")

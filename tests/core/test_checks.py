@@ -104,8 +104,8 @@ def test_right_values_pass_and_wrong_ones_are_told_in_one_line(name):
     [
         ("positive", [1.0, -2.0, -3.0], "x = -2.0: must be greater than 0"),
         ("probabilities", [0.5, 0.75], "sum of x = 1.25: must be 1"),
-        ("number", 80 * "y", f"x = '{76 * 'y'}...: must be a whole number greater than 0"),
-        ("number", 78 * "y", f"x = '{78 * 'y'}': must be a whole number greater than 0"),
+        ("number", 200 * "y", f"x = '{199 * 'y'}...: must be a whole number greater than 0"),
+        ("number", 198 * "y", f"x = '{198 * 'y'}': must be a whole number greater than 0"),
         ("type", Config(), "x = Config: must be Belief, as made"),
         ("type", Belief, "x = <class 'jaxsense.core.types.Belief'>: must be Belief, as made"),
         ("members", Legs, "x = Legs: must be a Walker, not its class"),

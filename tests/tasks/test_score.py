@@ -73,7 +73,7 @@ def with_reward(task, reward):
 @pytest.mark.parametrize("reward", [dqn.Nats(0.2), dqn.Paper(0.0)])
 def test_a_changed_task_has_no_score_under_its_name(reward):
     changed = with_reward(jaxsense.make("noisy-v0"), reward)
-    with pytest.raises(ConfigError, match=r"task = .*noisy-v0.*: must be as made; give a changed"):
+    with pytest.raises(ConfigError, match=r"task = Task: must be as made; give a changed"):
         jaxsense.score(changed, nop)
 
 
