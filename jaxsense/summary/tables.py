@@ -15,7 +15,6 @@ from jaxsense.summary.blocks import (
     Case,
     Metric,
     Missions,
-    Number,
     Results,
     Timing,
     mean,
@@ -135,13 +134,8 @@ def _missions(played: Mapping[str, Case], caption: str) -> Table:
         ends = {reason: mean(n) for reason, n in case["ended"].items() if reason != "finished"}
         words = (f"{n:g} {reason}".replace(" ", "\u00a0") for reason, n in ends.items())
         rows.append((name, [*texts, ", ".join(words)]))
-    columns, meanings = [*table.columns, "unfinished"], table.meanings | {"unfinished": _UNFINISHED}
-    if "naive" in played:
-        columns.insert(3, "against naive")
-        meanings["against naive"] = "Difference of the median times."
-        for (_, texts), case in zip(rows, played.values(), strict=True):
-            texts.insert(3, _percent(case["time_s"], played["naive"]["time_s"]))
-    return Table(caption, columns, rows, meanings)
+    meanings = {**table.meanings, "unfinished": _UNFINISHED}
+    return Table(caption, [*table.columns, "unfinished"], rows, meanings)
 
 
 def all_of_missions(block: Missions) -> list[Table]:
@@ -152,14 +146,6 @@ def all_of_missions(block: Missions) -> list[Table]:
             groups[_CAPTIONS[key.rpartition(".")[0]]].append(metric)
     found = [of_metrics(caption, block, metrics) for caption, metrics in groups.items()]
     return [table for table in found if table.rows]
-
-
-def _percent(value: Number, reference: Number) -> str:
-    """A difference in percent of a reference, as text."""
-    if not mean(reference):
-        return "-"
-    percent = round(100 * (mean(value) / mean(reference) - 1))
-    return f"{percent:+d}\u00a0%" if percent else "="
 
 
 def times(results: Results, timing: Timing) -> list[Table]:
