@@ -179,19 +179,16 @@ def _surroundings() -> list[object]:
     ]
 
 
-class Compiler:
-    """Compiles the programs of a run in its own threads, until the end of the block."""
+class Compiler(ThreadPoolExecutor):
+    """Threads that compile the programs of a run, until the end of the block."""
 
     def __init__(self, monitor: Monitor, kept: Kept | None = None):
+        super().__init__(devices.NUM_THREADS, "compile")
         self.monitor, self.kept = monitor, kept
-        self.threads = ThreadPoolExecutor(devices.NUM_THREADS, "compile")
-
-    def __enter__(self) -> "Compiler":
-        return self
 
     def __exit__(self, *_: object) -> None:
         """Cancels pending work, which would keep the process alive."""
-        self.threads.shutdown(wait=False, cancel_futures=True)
+        self.shutdown(wait=False, cancel_futures=True)
 
 
 class Program:
@@ -233,7 +230,7 @@ class Program:
             devices.give_back_freed()
             return compiled
 
-        self._compiled = self._compiler.threads.submit(compile_lowered)
+        self._compiled = self._compiler.submit(compile_lowered)
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lowered.out_info)
 
     def _lower(

@@ -33,14 +33,6 @@ _SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # 
 
 
 @dataclasses.dataclass(frozen=True)
-class Trained:
-    """Outputs and curves of stages."""
-
-    outputs: dict[str, Output]
-    curves: dict[str, Curves]
-
-
-@dataclasses.dataclass(frozen=True)
 class Learned:
     """The results of a training.
 
@@ -65,8 +57,7 @@ class Learned:
 
 def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
     """Trains everything and summarises it; see `train`."""
-    config, trained = programs.config, train(key, programs, checkpoints)
-    outputs, curves = trained.outputs, trained.curves
+    config, (outputs, curves) = programs.config, train(key, programs, checkpoints)
     posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
     measured, reliability = jax.tree.map(np.asarray, outputs["detector_metrics"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
@@ -123,7 +114,9 @@ def play(
     return played, make.missions(programs.config, played.metrics)
 
 
-def train(key: Key, programs: Programs, checkpoints: Checkpoints) -> Trained:
+def train(
+    key: Key, programs: Programs, checkpoints: Checkpoints
+) -> tuple[dict[str, Output], dict[str, Curves]]:
     """Runs all stages; independent ones run side by side.
 
     Args:
@@ -131,6 +124,9 @@ def train(key: Key, programs: Programs, checkpoints: Checkpoints) -> Trained:
       programs: of the stages, with the settings; their monitor receives time and progress.
       checkpoints: where to save. Stages found there, which must come from the same key and
         settings, are not trained again.
+
+    Returns:
+      Outputs and curves of the stages.
 
     Raises:
       StageError: if a loss, parameter or result is not finite; trainings under way are saved as
@@ -153,7 +149,7 @@ def train(key: Key, programs: Programs, checkpoints: Checkpoints) -> Trained:
         for _ in done:
             devices.give_back_freed()
     programs.monitor.check_stop()
-    return Trained({name: output.result() for name, output in kept.items()}, training.curves)
+    return {name: output.result() for name, output in kept.items()}, training.curves
 
 
 @dataclasses.dataclass(frozen=True)

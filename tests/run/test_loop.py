@@ -56,7 +56,8 @@ def toy(replace_training, tmp_path):
         path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
         checkpoints = Checkpoints(path, warned.append)
         with Compiler(monitor) as compiler:
-            found = pipeline.train(KEY, Programs(SMOKE, compiler), checkpoints)
+            outputs, curves = pipeline.train(KEY, Programs(SMOKE, compiler), checkpoints)
+        found = SimpleNamespace(outputs=outputs, curves=curves)
         return found, [report for report in heard if report[2]], warned
 
     return train

@@ -23,18 +23,16 @@ def test_learn_and_a_run_come_to_the_same(monkeypatch, tmp_path):
     monitor = Monitor()
     with Compiler(monitor) as compiler:
         programs = Programs(config, compiler)
-        found = pipeline.train(KEY, programs, Checkpoints(tmp_path))
+        outputs, curves = pipeline.train(KEY, programs, Checkpoints(tmp_path))
     # A few steps, after which rounding has not yet made learning part ways.
     learned = jax.jit(lambda key: learn(key, config))(KEY)
     assert bool(learned.is_finite)
-    assert set(learned.outputs) - set(found.outputs) == {"scenes", "survey", "examples"}
+    assert set(learned.outputs) - set(outputs) == {"scenes", "survey", "examples"}
     close = lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-3)  # noqa: E731
-    of_learn, of_run = (
-        training.stages.models(outputs, config) for outputs in (learned.outputs, found.outputs)
-    )
+    of_learn, of_run = (training.stages.models(each, config) for each in (learned.outputs, outputs))
     jax.tree.map(close, of_learn, of_run)
     steps = {stage.name: stage.steps for stage in programs.stages}
     for name, progress in learned.progress.items():
         assert len(progress.loss) == steps[name]
         for metric, values in progress.metrics.items():
-            close(values, found.curves[name][metric])
+            close(values, curves[name][metric])
