@@ -16,7 +16,6 @@ from jaxsense.tasks import Task
 _SIZE = 4.0  # inches, of each part
 _DPI = 100
 _ARROW = 0.6  # m, from a robot to where it looks
-_MARGIN = 0.8  # m, around places
 
 
 def frame(task: Task, state: State) -> np.ndarray:
@@ -65,21 +64,17 @@ def frames(task: Task, states: PyTree) -> tuple[np.ndarray, ...]:
 
 def _draw_places(ax: Axes, team: Team, agent: int, nearest: np.ndarray, truth: np.ndarray) -> None:
     """PoIs, in the colour of the most likely class within that of the true one, and robots."""
-    for n in np.flatnonzero(team.present):
-        edge = {"markeredgecolor": truth[n], "markeredgewidth": 3}
-        x, y = team.positions[n]
-        ax.plot(x, y, "o", color=nearest[n], markersize=16, **edge)
-        ax.text(x, y, str(n), ha="center", va="center", color="w", weight="bold")
-    for r, (x, y, yaw) in enumerate(team.poses):
-        colour = modality_colour(int(team.modality[r])) if team.works[r] else "0.7"
-        if team.works[r] and team.target[r] < len(team.positions):
-            goal = team.positions[team.target[r]]
-            ax.plot([x, goal[0]], [y, goal[1]], ":", color=colour)
-        ends = [x, x + _ARROW * np.cos(yaw)], [y, y + _ARROW * np.sin(yaw)]
-        ax.plot(*ends, color=colour, linewidth=3)
-        edge = "k" if r == agent else colour
-        ax.plot(x, y, "o", color=colour, markersize=10, markeredgewidth=2, markeredgecolor=edge)
-    places = np.concatenate([team.positions[team.present], team.poses[:, :2]])
-    (left, bottom), (right, top) = places.min(axis=0) - _MARGIN, places.max(axis=0) + _MARGIN
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    ax.set_title("places (rim: truth)")
+    pois, places = np.flatnonzero(team.present), team.positions
+    ax.scatter(*places[pois].T, 250, nearest[pois], edgecolors=truth[pois], linewidths=3)
+    for n in pois:
+        ax.text(*places[n], str(n), ha="center", va="center", color="w", weight="bold")
+    colours = [modality_colour(int(m)) for m in team.modality]
+    for r, colour in enumerate(np.where(team.works, colours, "#b3b3b3")):
+        here, yaw = team.poses[r, :2], team.poses[r, 2]
+        if team.works[r] and team.target[r] < len(places):
+            ax.plot(*np.stack([here, places[team.target[r]]]).T, ":", color=colour)
+        ahead = here + _ARROW * np.array([np.cos(yaw), np.sin(yaw)])
+        ax.plot(*np.stack([here, ahead]).T, color=colour, linewidth=3)
+        ax.scatter(*here, 100, colour, edgecolors="k" if r == agent else colour, zorder=3)
+    ax.margins(0.2)
+    ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="places (rim: truth)")

@@ -114,7 +114,7 @@ def fit_stage(name: str, steps: int, fit: Callable[..., Fit]) -> Stage:
     Args:
       fit: `(config, **inputs) -> Fit`, whose problem has these `steps`.
     """
-    size, chunks = in_chunks(steps)
+    size = -(-steps // _MAX_CHUNKS)
 
     def begin(key: Key, config: Config, **inputs: Output) -> tuple[Output, FitState]:
         given = fit(config, **inputs)
@@ -132,7 +132,7 @@ def fit_stage(name: str, steps: int, fit: Callable[..., Fit]) -> Stage:
     def finish(config: Config, state: tuple[Output, FitState], **inputs: Output) -> Output:
         return fit(config, **inputs).trained(*state)
 
-    return Stage(name, begin, advance, finish, steps, chunks)
+    return Stage(name, begin, advance, finish, steps, chunks=-(-steps // size))
 
 
 Start = tuple[Callable[[Key], Params], Problem[Any]]
@@ -160,12 +160,6 @@ def restarts(config: Config, start: Callable[..., Start]) -> list[Stage]:
 def key_of(key: Key, name: str) -> Key:
     """Random key that depends on a name, for example of a stage."""
     return jax.random.fold_in(key, zlib.crc32(name.encode()))
-
-
-def in_chunks(steps: int) -> tuple[int, int]:
-    """Steps of each of at most 20 chunks, and number of chunks."""
-    size = -(-steps // _MAX_CHUNKS)
-    return size, -(-steps // size)
 
 
 def is_finite(values: Output) -> Bool[Array, ""]:

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsense import recorded
 from jaxsense.config import LidarConfig
-from jaxsense.recorded import noise as noises
+from jaxsense.recorded import scans as noises
 
 ANGLES = np.radians(np.linspace(-90, 90, 361)).astype(np.float32)
 

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsense.config import CameraConfig, LidarConfig
 from jaxsense.recorded import resampling
-from jaxsense.recorded.looks import resample
+from jaxsense.recorded.scans import resample
 from jaxsense.sim import sensors
 
 LIDAR = sensors.lidar(LidarConfig(num_beams=9, field_of_view=80.0, window=3))  # every 10 degrees
