@@ -288,7 +288,7 @@ class Section(Checked):
 
     def __post_init__(self):
         check_fields(self)
-        _known(self).check()
+        jax.tree.map(_number, self).check()
 
 
 class _Unknown:
@@ -305,17 +305,11 @@ class _Unknown:
         return "a traced number"
 
 
-def _known(value: Any) -> Any:
-    """Settings with numbers for scalar arrays, and `_Unknown` for other leaves."""
-    if isinstance(value, Section):
-        known = object.__new__(type(value))
-        vars(known).update({name: _known(each) for name, each in vars(value).items()})
-        return known
-    if isinstance(value, tuple):
-        return tuple(map(_known, value))
-    if isinstance(value, jax.Array | jax.ShapeDtypeStruct):
-        return _Unknown() if _is_unknown(value) else cast(jax.Array, value).item()
-    return value
+def _number(leaf: Any) -> Any:
+    """The number in a scalar array; `_Unknown` of other arrays."""
+    if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
+        return leaf
+    return _Unknown() if _is_unknown(leaf) else cast(jax.Array, leaf).item()
 
 
 def _is_unknown(value: object) -> bool:

@@ -84,7 +84,8 @@ class Monitor:
 
     def fail(self, failure: BaseException) -> None:
         """Stops everything that runs or waits beside what has failed."""
-        self._failure = self._failure or failure
+        if self._failure is None or isinstance(self._failure, StageError):
+            self._failure = failure  # which another run may not forget
 
     @property
     def is_stopping(self) -> bool:

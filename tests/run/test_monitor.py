@@ -53,3 +53,15 @@ def test_stages_stop_if_they_are_asked_to_and_if_one_of_them_has_failed():
         asked.check_stop()
     with pytest.raises(StageError, match="jmvae: loss = nan"):
         failed.check_stop()
+
+
+def test_another_run_forgets_a_stage_that_failed_and_nothing_else():
+    monitor = Monitor()
+    monitor.fail(StageError("jmvae: loss = nan"))
+    monitor.begin(lambda *_: None)
+    monitor.check_stop()
+    monitor.fail(StageError("jmvae: loss = nan"))
+    monitor.fail(ArithmeticError("cannot be traced"))
+    monitor.begin(lambda *_: None)
+    with pytest.raises(ArithmeticError):
+        monitor.check_stop()
