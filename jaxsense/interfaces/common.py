@@ -119,10 +119,9 @@ def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
     if isinstance(mdp, Task) and mdp.mdp.teams and config is None:
         carried = tuple(mdp.modalities[int(m)] for m in mdp.mdp.robots)
         return Robots(mdp, names_of_robots(carried))
-    teams = mdp.teams if isinstance(mdp, Mdp) else None
-    if isinstance(mdp, Mdp) and teams and config and teams.modalities == config.modalities:
+    if isinstance(mdp, Mdp) and mdp.teams and config and mdp.modalities == config.modalities:
         robots = jnp.array(config.modality_of_robot, jnp.int32)
-        whole = dataclasses.replace(teams, is_random=False)
+        whole = dataclasses.replace(mdp.teams, is_random=False)
         played = dataclasses.replace(mdp, robots=robots, teams=whole)
         return Robots(Environment(played), config.robot_names)
     given = type(mdp).__name__ if isinstance(mdp, Mdp) else repr(mdp)

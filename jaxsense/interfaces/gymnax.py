@@ -88,13 +88,6 @@ class MapEnv(environment.Environment[MapEnvState, MapEnvParams]):
         """`[N + 1]` bool, the actions that exist."""
         return self.played.action_mask(state.map)
 
-    def observe(
-        self, key: Key, state: MapEnvState, action: ArrayLike | None, params: MapEnvParams
-    ) -> jax.Array:
-        """What the policy sees of a state."""
-        del key, action, params
-        return self.played.observe(state.map)
-
     def is_terminated(self, state: MapEnvState, params: MapEnvParams) -> jax.Array:
         """Whether the last action was NOP, `[]` bool."""
         del params
