@@ -96,7 +96,7 @@ _NOISY = Config(
         num_repeats=12288,
     ),
     jmvae=JmvaeConfig(fusion="filter", samples_per_class=8000),
-    mdp=MdpConfig(reward="nats", look_cost=0.1),
+    mdp=MdpConfig(reward="nats"),
     dqn=DqnConfig(hidden=(64, 64), epochs=600),
     team=TeamConfig(sides=(4.0, 9.0)),
     evaluation=EvaluationConfig(num_histories=65520, value_looks=128),

@@ -1,7 +1,5 @@
 """Trained models that travel with the package."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -15,20 +13,16 @@ from jaxsense.core.types import Belief, placed
 from jaxsense.tasks import registry
 
 
-def with_sizes_of(config, other):
-    """Settings with detectors of other sizes: those that travel were made of two networks each."""
-    detector = dataclasses.replace(other.detector, hidden=config.detector.hidden)
-    return dataclasses.replace(other, detector=detector)
-
-
 @pytest.mark.parametrize("preset", tasks.PRETRAINED)
 def test_models_have_the_settings_of_their_preset(preset):
     config, models = jaxsense.load_pretrained(preset)
-    assert config == with_sizes_of(config, jaxsense.PRESETS[preset])
+    assert config == jaxsense.PRESETS[preset]
     expected = jax.eval_shape(lambda: jaxsense.init(jax.random.key(0), config))
     assert jax.tree.structure(models) == jax.tree.structure(expected)
     made = tasks.origin(preset)
-    assert made.command == f"python -m jaxsense.train --preset {preset} --seed {made.seed}"
+    # Options that have become the preset's since may stand between.
+    assert made.command.startswith(f"python -m jaxsense.train --preset {preset} ")
+    assert made.command.endswith(f"--seed {made.seed}")
     assert len(made.commit) == 40
     assert {"jaxsense", "jax", "python"} <= set(made.versions)
 
