@@ -162,7 +162,7 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
         (["--policy", "best"], "policy = 'best': must be one of latent"),
         (["--seed", "-1"], "seed = -1: must be a whole number, from 0 to 4,294,967,295"),
         (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
-        (["--out", "full/file"], "out = 'full/file': cannot be written"),
+        (["--out", "full/file"], "full/file: cannot be used (File exists)"),
         (["--cache", "full/file"], "cache = 'full/file': must be a directory"),
     ],
 )

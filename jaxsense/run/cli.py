@@ -54,16 +54,16 @@ def fail(program: str, message: str) -> NoReturn:
 
 @contextlib.contextmanager
 def ending(program: str, advice: str = "") -> Iterator[None]:
-    """Ends a program at an error that its user can correct; `advice` follows those about files."""
+    """Ends a program at an error that its user can correct; `advice` follows a full disk."""
     try:
         yield
     except (ConfigError, StageError) as error:
         fail(program, str(error))
     except OSError as error:
-        # Usually a full disk. Every file is written as a whole or not at all.
-        cannot = "cannot write " if isinstance(error, WriteError) else ""
-        reason = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        fail(program, f"{cannot}{reason}{advice}")
+        if isinstance(error, WriteError):  # every file is written as a whole or not at all
+            fail(program, f"cannot write {error.filename}: {error.strerror}{advice}")
+        cannot = f"{error.filename}: cannot be used ({error.strerror})"
+        fail(program, cannot if error.filename else str(error))
 
 
 def keep_programs(

@@ -59,14 +59,13 @@ class RunDirectory:
           settings: of the run.
 
         Raises:
-          ConfigError: if the directory is not empty, cannot be written, or is locked by another
-            process.
+          ConfigError: if the directory is not empty.
+          OSError: if it cannot be written, or another process has locked it.
         """
-        with begun(path, settings.preset) as place, _locked(place, "out"):
+        with begun(path, settings.preset) as place, files.locked(place):
             run = cls(place, settings)
-            with _writable(place, "out"):
-                # There is none, unless another process has been faster.
-                write_json(place / "config.json", as_json(settings), is_new=True)
+            # There is none, unless another process has been faster.
+            write_json(place / "config.json", as_json(settings), is_new=True)
             try:
                 yield run
             except (ConfigError, KeyboardInterrupt):
@@ -79,10 +78,11 @@ class RunDirectory:
         """Opens the directory of a stopped run, and locks it for this process.
 
         Raises:
-          ConfigError: see `resumable`; also if another process locks the directory.
+          ConfigError: see `resumable`.
+          OSError: if another process has locked the directory.
         """
         settings = resumable(path, trust)
-        with _locked(path, "resume"):
+        with files.locked(path):
             run = cls(path, settings)
             run._remove_partial()
             run._mend_metrics()
@@ -177,40 +177,22 @@ def begun(path: Path | None, name: str) -> Iterator[Path]:
       name: what is in it.
 
     Raises:
-      ConfigError: if the directory is not empty or cannot be made.
+      ConfigError: if the directory is not empty.
+      OSError: if it cannot be made.
     """
-    with _writable(path or Path("runs"), "out"):
-        is_new = path is None or not path.exists()
-        path = path or dated(name)
-        path.mkdir(parents=True, exist_ok=True)
-        # A process that was killed at once leaves the lock.
-        if any(each.name != ".lock" for each in path.iterdir()):
-            reason = "is not empty; must be a new or empty directory"
-            raise ConfigError("out", str(path), reason)
+    is_new = path is None or not path.exists()
+    path = path or dated(name)
+    path.mkdir(parents=True, exist_ok=True)
+    # A process that was killed at once leaves the lock.
+    if any(each.name != ".lock" for each in path.iterdir()):
+        reason = "is not empty; must be a new or empty directory"
+        raise ConfigError("out", str(path), reason)
     try:
         yield path
     finally:
         with contextlib.suppress(OSError):
             if is_new:
                 path.rmdir()
-
-
-@contextlib.contextmanager
-def _writable(path: Path, field: str) -> Iterator[None]:
-    """Raises each `OSError` as a `ConfigError` about a directory that cannot be written."""
-    try:
-        yield
-    except OSError as error:
-        raise ConfigError(field, str(path), f"cannot be written ({error.strerror})") from None
-
-
-@contextlib.contextmanager
-def _locked(path: Path, field: str) -> Iterator[None]:
-    """Locks a directory; raises `ConfigError` about `field` if that cannot be done."""
-    with contextlib.ExitStack() as kept:
-        with _writable(path, field):
-            kept.enter_context(files.locked(path))
-        yield
 
 
 def write_json(

@@ -165,8 +165,11 @@ def test_evaluate_refuses_a_broken_summary(summary, run, capsys):
     [
         (StageError("jmvae: the loss of step 3 is not finite"), "jmvae: the loss of step 3 is not"),
         (WriteError(28, "No space left on device", "x"), "cannot write x: No space left on device"),
-        (PermissionError(13, "Permission denied", "x"), "train: x: Permission denied; earlier"),
-        (OSError("Orbax, in\ntwo lines"), "train: Orbax, in two lines; earlier checkpoints"),
+        (
+            PermissionError(13, "Permission denied", "x"),
+            "train: x: cannot be used (Perm",
+        ),
+        (OSError("Orbax, in\ntwo lines"), "train: Orbax, in two lines"),
         (ConfigError("checkpoint", "x", "is damaged"), "train: checkpoint = 'x': is damaged"),
     ],
 )

@@ -34,7 +34,7 @@ def test_of_two_that_want_one_directory_the_second_is_refused(tmp_path):
         assert read_settings(run.path / "config.json") == SETTINGS
         (path / "config.json").unlink()  # as if the first one had not yet come so far
         with (
-            pytest.raises(ConfigError, match="another process is writing to it"),
+            pytest.raises(BlockingIOError, match="another process is writing to it"),
             RunDirectory.create(path, SETTINGS),
         ):
             pass
