@@ -65,9 +65,11 @@ def frames(task: Task, states: PyTree) -> tuple[np.ndarray, ...]:
 def _draw_places(ax: Axes, team: Team, agent: int, nearest: np.ndarray, truth: np.ndarray) -> None:
     """PoIs, in the colour of the most likely class within that of the true one, and robots."""
     pois, places = np.flatnonzero(team.present), team.positions
-    ax.scatter(*places[pois].T, 250, nearest[pois], edgecolors=truth[pois], linewidths=3)
+    style = {"s": 250, "c": nearest[pois], "edgecolors": truth[pois], "linewidths": 3}
+    ax.scatter(*places[pois].T, **style)
     for n in pois:
-        ax.text(*places[n], str(n), ha="center", va="center", color="w", weight="bold")
+        x, y = places[n]
+        ax.text(x, y, str(n), ha="center", va="center", color="w", weight="bold")
     colours = [modality_colour(int(m)) for m in team.modality]
     for r, colour in enumerate(np.where(team.works, colours, "#b3b3b3")):
         here, yaw = team.poses[r, :2], team.poses[r, 2]
@@ -75,6 +77,6 @@ def _draw_places(ax: Axes, team: Team, agent: int, nearest: np.ndarray, truth: n
             ax.plot(*np.stack([here, places[team.target[r]]]).T, ":", color=colour)
         ahead = here + _ARROW * np.array([np.cos(yaw), np.sin(yaw)])
         ax.plot(*np.stack([here, ahead]).T, color=colour, linewidth=3)
-        ax.scatter(*here, 100, colour, edgecolors="k" if r == agent else colour, zorder=3)
+        ax.scatter(*here, s=100, color=colour, edgecolors="k" if r == agent else colour, zorder=3)
     ax.margins(0.2)
     ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title="places (rim: truth)")
