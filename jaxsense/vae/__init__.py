@@ -1,11 +1,9 @@
 """Detectors, the joint multi-modal VAE, and fusion in its latent space."""
 
-from jaxsense.vae.detectors import Detection as Detection
 from jaxsense.vae.detectors import Detector as Detector
 from jaxsense.vae.detectors import Looks as Looks
 from jaxsense.vae.detectors import features as features
 from jaxsense.vae.detectors import retrain as retrain
-from jaxsense.vae.fusion import Filter as Filter
 from jaxsense.vae.fusion import InPlace as InPlace
 from jaxsense.vae.fusion import prior as prior
 from jaxsense.vae.gaussian import product_of_experts as product_of_experts
