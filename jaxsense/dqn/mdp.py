@@ -400,9 +400,8 @@ def _look(
     if mdp.novelty is not None and looked_from is not None:
         earlier = looked_from[place, modality]
         weight = mdp.novelty.weight(_apart(pose[:2], earlier), modality)
-        # A robot alone is where the PoIs are: its looks are all new.
-        is_alone = jnp.all(pose[:2] == state.team.positions[place])
-        here = jnp.where(is_alone, _NEVER, pose[:2])
+        is_there = _is_there(pose[:2], state.team.positions[place])
+        here = jnp.where(is_there, _NEVER, pose[:2])
         latest = jnp.concatenate([here[None], earlier[:-1]])
         looked_from = looked_from.at[place, modality].set(latest)
 
@@ -451,6 +450,11 @@ def _to_go(
     return jax.vmap(of_robot)(team.poses, team.modality, target, goals)
 
 
+def _is_there(place: Float[Array, "2"], positions: Float[Array, "*S 2"]) -> Bool[Array, "*S"]:
+    """Whether a robot is where PoIs are, as one without travel is."""
+    return jnp.all(positions == jnp.broadcast_to(place, positions.shape), axis=-1)
+
+
 def _apart(place: Float[Array, "2"], places: Float[Array, "K 2"]) -> Float[Array, " K"]:
     """Distances from earlier looks, in metres."""
     return jnp.linalg.norm(places - place[None], axis=-1)
@@ -461,7 +465,9 @@ def _earlier(key: Key, mdp: Mdp, team: Team, seen: Bool[Array, "N M"]) -> Float[
     angle = jax.random.uniform(key, seen.shape, maxval=2 * jnp.pi)
     around = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     places = team.positions[:, None] + mdp.travel.view_distance * around
-    last = jnp.where(seen[..., None], places, _NEVER)
+    # Looks of a robot that is where the PoIs are do not repeat each other.
+    counts = seen & ~_is_there(team.poses[0, :2], team.positions)[:, None]
+    last = jnp.where(counts[..., None], places, _NEVER)
     return jnp.full((*seen.shape, _RECENT, 2), _NEVER).at[:, :, 0].set(last)
 
 
