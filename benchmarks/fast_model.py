@@ -65,9 +65,18 @@ def looks(record: Record, positions: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def predicted(
-    mdp: Mdp, positions: jax.Array, poses: jax.Array, modality: jax.Array, looks: jax.Array
+    mdp: Mdp,
+    features: tuple[jax.Array, ...],
+    positions: jax.Array,
+    poses: jax.Array,
+    modality: jax.Array,
+    looks: jax.Array,
 ) -> jax.Array:
-    """`[]` seconds until robots have looked at `[R, L]` PoIs in the MDP."""
+    """`[]` seconds until robots have looked at `[R, L]` PoIs in the MDP.
+
+    Args:
+      features: for each modality `[N, D_m]` of looks before the start, of which there are none.
+    """
     number, (num_robots, most) = len(positions), looks.shape
     team = Team(
         positions=positions,
@@ -79,8 +88,7 @@ def predicted(
     )
     classes = jnp.zeros(number, jnp.int32)
     seen = jnp.zeros((number, mdp.num_modalities), bool)
-    nothing = tuple(jnp.zeros((number, x.shape[-1])) for x in mdp.looks.features)
-    start = mdps.begin(jax.random.key(0), mdp, team, classes, classes, seen, nothing)
+    start = mdps.begin(jax.random.key(0), mdp, team, classes, classes, seen, features)
 
     def choose(carry: tuple[mdps.State, jax.Array]) -> tuple[mdps.State, jax.Array]:
         state, taken = carry
@@ -106,15 +114,16 @@ def compare(
     of_mission = lambda i: jax.tree.map(lambda x: x[i], (records, states.scene.layout.position))  # noqa: E731
     of_each = [looks(*of_mission(i)) for i in range(episodes)]
     sequences, times = (np.stack(x) for x in zip(*of_each, strict=True))
-    predict = jax.jit(jax.vmap(predicted, (None, 0, 0, None, 0)))
+    nothing = tuple(jnp.zeros((config.arena.num_pois, size)) for size in sizes)
+    predict = jax.jit(jax.vmap(predicted, (None, None, 0, 0, None, 0)))
     scene, modality = states.scene, jnp.array(config.modality_of_robot)
-    found = predict(mdp, scene.layout.position, scene.poses, modality, sequences)
+    found = predict(mdp, nothing, scene.layout.position, scene.poses, modality, sequences)
     return np.asarray(found), times
 
 
 def main() -> None:
     """Compares the MDP with missions, and prints a line for each number of PoIs."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser("python -m benchmarks.fast_model")
     parser.add_argument("preset")
     parser.add_argument("--policy", default="latent")
     parser.add_argument("--pois", type=int, nargs="*", default=[])

@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None, policies: OwnPolicies | None = None) -> 
         scenario = scenario.playing(case.policy for case in played.values())
         kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
         # If these files cannot be written, fail now rather than after minutes of work.
-        with files.locked(arguments.run, wait=True):
+        with files.locked(arguments.run, on_wait=say):
             _report(arguments.run, trained)
             (arguments.run / EVALUATIONS).mkdir(exist_ok=True)
         number = arguments.episodes * len(played)
@@ -125,23 +125,28 @@ def _write(arguments: Arguments, trained: Config, config: Config, missions: bloc
     for case in missions.values():
         case["seed"] = arguments.seed
     stem = f"{_place(config)}-seed-{arguments.seed}-{arguments.episodes}-missions"
-    with files.locked(run, wait=True):
-        # Another policy may have played in the same arenas; what other code made is replaced.
-        before = read_evaluations(run).get(stem)
-        if before and not compare.differences_of([before.get("origin", compare.UNKNOWN), origin]):
-            missions = before["mission"] | missions
+    with files.locked(run, on_wait=say):
+        # Another policy may have played in the same arenas before; by other code, it stands apart.
+        others = read_evaluations(run)
+        apart = {
+            name: compare.differences_of([other.get("origin", compare.UNKNOWN), origin])
+            for name, other in others.items()
+        }
+        names = [stem, *(f"{stem}-{n + 2}" for n in range(len(others)))]
+        name = next(name for name in names if not apart.get(name))
         found: blocks.Evaluation = {
             "num_pois": config.arena.num_pois,
             "side": config.arena.side,
             "robots": list(config.carried),
             "origin": origin,
-            "mission": missions,
+            "mission": {**(others[name]["mission"] if name in others else {}), **missions},
         }
-        path = run / EVALUATIONS / f"{stem}.json"
+        path = run / EVALUATIONS / f"{name}.json"
         rundir.write_json(path, found)
         # Robots that are alone or fail are not drawn.
-        if policies_of(missions):
-            files.write(path.with_suffix(".svg"), drawing.svg(plots.policies(missions)))
+        if policies_of(found["mission"]):
+            plot = plots.policies(found["mission"])
+            files.write(path.with_suffix(".svg"), drawing.svg(plot))
         report = _report(run, trained)
     return f"The metrics are in {path}, and with all others in {report}."
 

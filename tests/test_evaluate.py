@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -19,7 +20,6 @@ from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import rundir
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
-from jaxsense.summary import compare
 
 
 @pytest.fixture(scope="module")
@@ -98,17 +98,32 @@ def test_policies_that_play_in_the_same_arenas_share_a_file(copy):
 
 
 @pytest.mark.parametrize("other", ["code", "JAX", "unknown"])
-def test_evaluations_by_others_are_replaced(copy, other):
+def test_evaluations_by_others_stand_apart(copy, other):
     before, origin = read(copy), rundir.origin()
     before["origin"] = {
         "code": {**origin, "source": "other"},
         "JAX": {**origin, "versions": {**origin["versions"], "jax": "0.0.1"}},
-        "unknown": compare.UNKNOWN,
+        "unknown": None,
     }[other]
-    (copy / "evaluations" / f"{NAME}.json").write_text(json.dumps(before))
-    write(evaluate.Arguments(copy, episodes=1), only(before["mission"], "nearest"))
-    assert set(read(copy)["mission"]) == {"nearest"}
-    assert read(copy)["origin"] == origin
+    if other == "unknown":
+        del before["origin"]
+    file = copy / "evaluations" / f"{NAME}.json"
+    file.write_text(json.dumps(before))
+    for _ in range(2):  # the second time, among those that this code has made
+        write(evaluate.Arguments(copy, episodes=1), only(before["mission"], "nearest"))
+    assert json.loads(file.read_text()) == before
+    apart = read(copy, f"{NAME}-2")
+    assert set(apart["mission"]) == {"nearest"}
+    assert apart["origin"] == origin
+    assert len([*(copy / "evaluations").glob("*.json")]) == 2
+    titles = re.findall(
+        "<h3>Evaluation: (.*)</h3>", (copy / "report.html").read_text(encoding="utf-8")
+    )
+    words = {"code": "source other", "JAX": "jax 0.0.1", "unknown": "source unknown"}[other]
+    ours, theirs = sorted(titles, key=len)
+    assert ours == "3 PoIs in 3 m; robots: 1 camera, 1 lidar; seed 0"
+    assert theirs.startswith(f"{ours}; ")
+    assert f"; {words}" in theirs
 
 
 def test_missions_elsewhere_have_the_settings_that_are_asked_for(capsys):

@@ -309,7 +309,10 @@ def begin(
     chex.assert_shape(seen, (mdp.num_pois, mdp.num_modalities))
     if seen.dtype != bool:
         raise ValueError(f"seen of dtype {seen.dtype}: must be bool")
-    place_key, key = (None, key) if mdp.novelty is None else jax.random.split(key)
+    looked_from = None
+    if mdp.teams is not None and mdp.novelty is not None:
+        place_key, key = jax.random.split(key)
+        looked_from = _earlier(place_key, mdp.teams.travel, team, seen)
     first = jax.random.randint(key, (mdp.num_pois,), 0, mdp.num_modalities)
     beliefs = jax.vmap(functools.partial(_looked_at, mdp))(looks, seen, first)
     return State(
@@ -322,7 +325,7 @@ def begin(
         asks=team.works,
         agent=jnp.argmax(team.works).astype(jnp.int32),
         looked=jnp.zeros(len(team.works)),
-        looked_from=None if mdp.novelty is None else _earlier(place_key, mdp, team, seen),
+        looked_from=looked_from,
         seconds=jnp.float32(0.0),
     )
 
@@ -460,11 +463,13 @@ def _apart(place: Float[Array, "2"], places: Float[Array, "K 2"]) -> Float[Array
     return jnp.linalg.norm(places - place[None], axis=-1)
 
 
-def _earlier(key: Key, mdp: Mdp, team: Team, seen: Bool[Array, "N M"]) -> Float[Array, "N M K 2"]:
+def _earlier(
+    key: Key, travel: Travel, team: Team, seen: Bool[Array, "N M"]
+) -> Float[Array, "N M K 2"]:
     """Places of the looks before the start: random ones in view of their PoIs."""
     angle = jax.random.uniform(key, seen.shape, maxval=2 * jnp.pi)
     around = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    places = team.positions[:, None] + mdp.travel.view_distance * around
+    places = team.positions[:, None] + travel.view_distance * around
     # Looks of a robot that is where the PoIs are do not repeat each other.
     counts = seen & ~_is_there(team.poses[0, :2], team.positions)[:, None]
     last = jnp.where(counts[..., None], places, _NEVER)

@@ -30,6 +30,7 @@ UNFINISHED = "unfinished"
 _REST = 2**20  # bytes of a checkpoint that are not numbers
 _DIGEST = hashlib.sha256().digest_size
 _PARTIAL_NAME = re.compile(r"\..+\.[0-9a-f]{16}\.unfinished")
+_WAIT_BEFORE_NOTICE = 1.0  # s
 
 
 class WriteError(OSError):
@@ -109,23 +110,27 @@ def remove_unfinished(directory: Path) -> None:
 
 
 @contextlib.contextmanager
-def locked(directory: Path, *, wait: bool = False) -> Iterator[None]:
+def locked(directory: Path, on_wait: Callable[[str], None] | None = None) -> Iterator[None]:
     """Locks a directory for this process, with the file `.lock` in it.
 
     Args:
       directory: must exist.
-      wait: whether to wait for another process that holds the lock.
+      on_wait: receives one line if another process still holds the lock after a second. Without
+        it, `locked` does not wait.
 
     Raises:
-      BlockingIOError: if another process holds the lock, without `wait`.
+      BlockingIOError: if another process holds the lock and there is no `on_wait`.
       OSError: if the lock cannot be taken.
     """
     lock = filelock.FileLock(directory / ".lock")
     try:
-        lock.acquire(timeout=-1 if wait else 0)
+        lock.acquire(timeout=0 if on_wait is None else _WAIT_BEFORE_NOTICE)
     except filelock.Timeout:
-        reason = "another process is writing to it; wait for it to end"
-        raise BlockingIOError(errno.EAGAIN, reason, str(directory)) from None
+        if on_wait is None:
+            reason = "another process is writing to it; wait for it to end"
+            raise BlockingIOError(errno.EAGAIN, reason, str(directory)) from None
+        on_wait(f"Waiting for another process to finish writing to {directory}.")
+        lock.acquire(timeout=-1)
     try:
         yield
     finally:

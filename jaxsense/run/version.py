@@ -12,6 +12,7 @@ _ROOT = Path(__file__).parents[2]
 _FILES = sorted(Path(__file__).parents[1].rglob("*.py"))
 SOURCE = hashlib.sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()[:16]
 """Digest of jaxsense, taken at import so that it matches the code that runs."""
+_PLACE = str(Path(__file__).relative_to(_ROOT))
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
@@ -26,13 +27,18 @@ def commit(source: Path = _ROOT) -> str | None:
 
     Args:
       source: the root of the tree, by default the one this package was imported from.
+
+    Returns:
+      The commit; None also if the package only lies in a repository that does not hold it.
     """
     if not (source / ".git").exists():
         return None
-    describe = ["describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
-    git = ["git", "-C", str(source), *describe]
+    git = ["git", "-C", str(source)]
+    ours = [*git, "ls-files", "--error-unmatch", _PLACE]
+    describe = [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
     try:
-        found = subprocess.run(git, capture_output=True, text=True, timeout=10, check=True)
+        subprocess.run(ours, capture_output=True, timeout=10, check=True)
+        found = subprocess.run(describe, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()

@@ -1,6 +1,7 @@
 """Files that are written as a whole, directories that are kept, and checkpoints."""
 
 import os
+import queue
 import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -79,22 +80,25 @@ def test_only_what_a_write_has_left_is_removed(tmp_path):
     assert all((tmp_path / name).exists() for name in kept)
 
 
-def test_a_directory_is_kept_for_one_at_a_time(tmp_path):
-    order = []
+def test_a_directory_is_kept_for_one_at_a_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_WAIT_BEFORE_NOTICE", 0.1)
+    order, said = [], queue.Queue()
 
     def wait():
-        with files.locked(tmp_path, wait=True):
+        with files.locked(tmp_path, on_wait=said.put):
             order.append("second")
 
-    with files.locked(tmp_path):
+    with files.locked(tmp_path, on_wait=pytest.fail):
         with pytest.raises(BlockingIOError), files.locked(tmp_path):
             pass
         waiting = threading.Thread(target=wait)
         waiting.start()
-        waiting.join(0.3)
+        line = said.get(timeout=10)
+        assert line == f"Waiting for another process to finish writing to {tmp_path}."
         order.append("first")
     waiting.join()
     assert order == ["first", "second"]
+    assert said.empty()
 
 
 def test_a_checkpoint_comes_back_as_it_was_saved(tmp_path):

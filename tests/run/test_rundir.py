@@ -141,7 +141,13 @@ def test_a_run_records_the_commit_of_its_source(tmp_path):
     git(tmp_path, "init")
     (tmp_path / "file").write_text("1")
     git(tmp_path, "add", "file")
-    git(tmp_path, "commit", "-m", "first")
+    git(tmp_path, "commit", "-m", "of somebody else")
+    installed = tmp_path / "jaxsense" / "run" / "version.py"
+    installed.parent.mkdir(parents=True)
+    installed.write_text("")
+    assert version.commit(tmp_path) is None
+    git(tmp_path, "add", "jaxsense")
+    git(tmp_path, "commit", "-m", "ours")
     git(tmp_path, "tag", "v1")
     head = git(tmp_path, "rev-parse", "HEAD")
     assert version.commit(tmp_path) == head
