@@ -95,6 +95,7 @@ def main(
       policies: custom policies by name; missions play those that `config.mission.policies` names.
     """
     arguments = parse(sys.argv[1:] if argv is None else argv, change, policies)
+    is_quiet = arguments.quiet
     if is_helper := bool(arguments.process_index):
         arguments = dataclasses.replace(arguments, quiet=True, tensorboard=False)
     with cli.ending(PROGRAM, "; earlier checkpoints are intact"):
@@ -105,7 +106,7 @@ def main(
                 arguments.coordinator,
                 arguments.num_processes,
                 arguments.process_index,
-                quiet=arguments.quiet,
+                quiet=is_quiet,
             )
             _train(arguments, run, policies)
         devices.leave()

@@ -169,7 +169,7 @@ class Option:
         """The description of the field, or of the dictionary with this entry, and the default."""
         known, value = docs(self.section), self.default
         text = next((known[field] for field in self.path.split(".")[::-1] if field in known), "")
-        if value not in (None, False, (), dataclasses.MISSING):
+        if value is not False and value not in (None, (), dataclasses.MISSING):
             words = shlex.join(map(str, value)) if isinstance(value, tuple) else value
             text += f" (default: {'on' if value is True else words})"
         return text.replace("`", "").replace("%", "%%")

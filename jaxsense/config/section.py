@@ -355,7 +355,7 @@ def named_function(field: str, path: str) -> Callable[..., object]:
     """
     try:
         return pkgutil.resolve_name(path)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         reason = f"must be a function that can be imported ({error})"
         raise ConfigError(field, path, reason) from None
 

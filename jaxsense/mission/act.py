@@ -69,8 +69,8 @@ def approach(
 ) -> tuple[MissionState, Course]:
     """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
 
-    A robot need not get to the viewpoint itself if a look from nearby is new; where it looks again,
-    from anywhere.
+    It looks on the way as soon as it sees the PoI from where a look is new, but after a failure
+    from the viewpoint itself.
 
     Returns:
       The next state, and where the robot wants to move, see `steer`.
@@ -85,7 +85,7 @@ def approach(
     is_here = own.view == num_views
     apart = me.map.apart(me.pose[None, :2], poi, me.modality)[0]
     is_new = models.novelty.to_go(apart, me.modality) <= 0
-    reach = jnp.where(is_new, jnp.inf, AT_VIEWPOINT)
+    reach = jnp.where(is_new & (own.attempts == 0), jnp.inf, AT_VIEWPOINT)
     is_there = is_here | (sees & (jnp.linalg.norm(viewpoint - me.pose[:2]) <= reach))
 
     time, is_driving = state.time, own.phase == DRIVING
@@ -270,6 +270,7 @@ def _write(
     me = Robot(mission, state, robot)
     own, poi, modality = me.own, me.target, me.modality
     attempts, excluded, gives_up = _fail(own, ~detects)
+    excluded = excluded.at[-1].set(excluded[-1] | ~detects)  # it has looked from where it stands
     belief, log_posterior = jax.tree.map(
         lambda rows, new: rows.at[poi].set(jnp.where(detects, new, rows[poi])),
         (state.belief, state.log_posterior),

@@ -259,6 +259,10 @@ class Program:
         """Adds the seconds of a block to those of the stage."""
         return self._monitor.measure(kind, self._stage)
 
+    def cancel(self) -> None:
+        """Does not compile the program, unless that has begun."""
+        self._compiled.cancel()
+
     def wait(self) -> Function:
         """Blocks until the program is compiled; raises what `Monitor.check_stop` does."""
         if not self._compiled.done():
@@ -304,6 +308,10 @@ class RowProgram:
         results = self._program.compile(function, *shapes[:whole], *some, mesh=mesh, whole=whole)
         self._results = jax.tree.map(lambda x: x.update(shape=(number, *x.shape[1:])), results)
         return self._results
+
+    def cancel(self) -> None:
+        """See `Program.cancel`."""
+        self._program.cancel()
 
     def __call__(self, *args: PyTree) -> PyTree[np.ndarray]:
         """Runs the program for all rows."""

@@ -34,7 +34,8 @@ CHUNK = math.ceil(2.5 / CONTROL_PERIOD)
 """Control periods between two reports."""
 # Missions side by side: what the caches of a thread of a CPU hold, and on each accelerator.
 _MOST_OF_CPU, _MOST_OF_ACCELERATOR = 192, 32768
-_BYTES_EACH = 2**20  # of an accelerator's memory, most of it for the physics
+# Of an accelerator's memory for each, most of it for the physics, and for paths between two PoIs.
+_BYTES_EACH, _BYTES_OF_PATHS = 2**20, 2**10
 # A control step of so many missions takes an accelerator twice as long as that of a few. With T
 # missions, B of which play at once, the time is about (T / B + 1) * (1 + B / this): B squared is
 # this times T at its minimum.
@@ -42,7 +43,7 @@ _AS_LONG_AS_NONE = 8192
 _MANY_POIS = 2**14  # of all missions that take longer to play than faster programs to compile
 
 
-def batch_of(total: int, workers: Workers = ALONE) -> int:
+def batch_of(total: int, num_pois: int, workers: Workers = ALONE) -> int:
     """Number of missions side by side: the more there are, the more pay on an accelerator.
 
     Some missions last long, so that a CPU is at work to the end with a third of them.
@@ -51,7 +52,8 @@ def batch_of(total: int, workers: Workers = ALONE) -> int:
     if memory is None:
         return min(_MOST_OF_CPU * workers.number, -(-total // 3))
     pays = math.isqrt(_AS_LONG_AS_NONE * total * workers.number)
-    return min(total, pays, min(_MOST_OF_ACCELERATOR, memory // _BYTES_EACH) * workers.number)
+    fit = memory // (_BYTES_EACH + _BYTES_OF_PATHS * num_pois**2)
+    return min(total, pays, min(_MOST_OF_ACCELERATOR, fit) * workers.number)
 
 
 @pytree
@@ -200,7 +202,9 @@ class Player:
         """
         self.mission, self._monitor, self._workers = mission, compiler.monitor, workers
         config, key, mesh = mission.config, jax.random.key(0), workers.mesh
-        batch = max(batch_of(total, workers), min(total, _RECORDED * workers.number))
+        batch = max(
+            batch_of(total, config.arena.num_pois, workers), min(total, _RECORDED * workers.number)
+        )
         self._share = -(-batch // workers.number)
         self._recorded = min(_RECORDED, self._share)
         self.batch = self._share * workers.number

@@ -278,7 +278,7 @@ class _Training:
             where = f"at step {chunk * size + bad[0] + 1} of {stage.steps}"
             raise StageError(f"{stage.name}: loss = {losses[bad[0]]} {where}")
         means = {
-            name: float(np.nanmean(values))
+            name: float(np.mean(values[np.isfinite(values)]))
             for name, values in {"loss": losses, **metrics}.items()
             if np.isfinite(values).any()
         }

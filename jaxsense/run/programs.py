@@ -84,7 +84,10 @@ class Programs:
         with self._lock:
             self._left[stage.program] -= 1
             if self._left[stage.program] == 0:
-                self._of[stage.program] = Future()
+                before, self._of[stage.program] = self._of[stage.program], Future()
+                if before.done():
+                    for program in before.result()[:3]:
+                        program.cancel()
 
     def _trace(self) -> None:
         """Traces all programs."""
@@ -116,8 +119,8 @@ class Programs:
     def _compile(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """Shapes of a stage's output; compiles its programs unless an earlier stage shares them."""
         name, key, config = stage.program, jax.random.key(0), self.config
-        if self._of[name].done():
-            return self._of[name].result().output
+        if (before := self._of[name]).done():
+            return before.result().output
 
         def first(key: Key, config: Config, inputs: dict[str, Output]) -> Output:
             return stage.begin(key, config, **inputs)

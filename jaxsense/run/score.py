@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
@@ -108,6 +109,7 @@ def score_missions(
       ValueError: if another argument is wrong, for example models of another run.
       RuntimeError: if the values of a policy, the models or the beliefs are not finite.
     """
+    episodes, seed = (int(x) if isinstance(x, np.integer) else x for x in (episodes, seed))
     _Asked(policies, against, episodes, seed)  # pyright: ignore[reportArgumentType]
     if not models.agent.plays(number := config.arena.num_pois):
         expected = "must be the number of PoIs that the models were trained with"

@@ -9,7 +9,9 @@ from pathlib import Path
 __version__ = "0.4.0"
 """Version of jaxsense."""
 _ROOT = Path(__file__).parents[2]
-_FILES = sorted(Path(__file__).parents[1].rglob("*.py"))
+_FILES = sorted(
+    path for path in Path(__file__).parents[1].rglob("*") if path.suffix in (".py", ".jinja")
+)
 SOURCE = hashlib.sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()[:16]
 """Digest of jaxsense, taken at import so that it matches the code that runs."""
 _PLACE = str(Path(__file__).relative_to(_ROOT))

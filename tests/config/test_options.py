@@ -35,6 +35,7 @@ class Ship:
       port: The port to leave.
       stops: Other ports.
       size: Length and width.
+      holes: Number of leaks.
       kind: What it is.
       log: Its log book.
       crew: Number of people, if it is known.
@@ -46,6 +47,7 @@ class Ship:
     stops: Positional[tuple[str, ...]] = ()
     sail: Sail = dataclasses.field(default=Sail())
     size: tuple[int, int] = (3, 1)
+    holes: int = 0
     kind: Literal["brig", "yawl"] = "brig"
     log: Path | None = None
     crew: int | None = None
@@ -66,6 +68,8 @@ options:
       Other ports.
   --size INT INT
       Length and width. (default: 3 1)
+  --holes INT
+      Number of leaks. (default: 0)
   --kind {{brig,yawl}}
       What it is. (default: brig)
   --log PATH
@@ -100,7 +104,7 @@ sail:
       Its area, in square metres.
       (default: 2.5)
 
---help-all lists all 10 options.
+--help-all lists all 11 options.
 """
 
 

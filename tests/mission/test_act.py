@@ -161,7 +161,10 @@ def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
         state = set_robot(state, CAMERA, phase=FACING, view=attempt)
         state = scan(jax.random.key(attempt), state, CAMERA)
         assert state.robots.attempts[CAMERA] == attempt
-        assert state.robots.excluded[CAMERA].sum() == attempt
+        # The viewpoints, and where it stands.
+        excluded = np.flatnonzero(state.robots.excluded[CAMERA])
+        views = state.robots.excluded.shape[1] - 1
+        np.testing.assert_array_equal(excluded, [*range(1, attempt + 1), views])
     np.testing.assert_array_equal(state.robots.undetected[CAMERA], [True, False, False])
 
 
@@ -202,6 +205,16 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     later = patience + 0.2 + act.RECOVERY_TIME + 0.1
     steps = jnp.int32(round(later / CONTROL_PERIOD))
     assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
+
+
+def test_a_robot_looks_on_the_way_but_after_a_failure_from_the_viewpoint(
+    approach, facing, set_robot
+):
+    # It wants to the far side of the PoI, which it sees already.
+    on_the_way = driving(facing(CAMERA), set_robot, 0, 0.1, 0.0)
+    assert approach(on_the_way, CAMERA).robots.phase[CAMERA] == FACING
+    failed = set_robot(on_the_way, CAMERA, attempts=1)
+    assert approach(failed, CAMERA).robots.phase[CAMERA] == DRIVING
 
 
 def test_a_viewpoint_on_which_a_robot_has_come_to_stand_is_left_without_blame(

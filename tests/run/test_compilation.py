@@ -189,7 +189,8 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
     assert not left.exists()
 
 
-def test_the_source_is_that_of_the_whole_package(tmp_path):
+@pytest.mark.parametrize("changed", ["vae/gaussian.py", "sim/arena.xml.jinja"])
+def test_the_source_is_that_of_the_whole_package(tmp_path, changed):
     root = Path(jaxsense.__file__).parent
     shutil.copytree(root, tmp_path / "jaxsense", ignore=shutil.ignore_patterns("*.pyc"))
     code = "from jaxsense.run import version; print(version.__file__, version.SOURCE)"
@@ -203,7 +204,7 @@ def test_the_source_is_that_of_the_whole_package(tmp_path):
         return source
 
     assert told() == version.SOURCE
-    with (tmp_path / "jaxsense" / "vae" / "gaussian.py").open("a", encoding="utf-8") as file:
+    with (tmp_path / "jaxsense" / changed).open("a", encoding="utf-8") as file:
         file.write("\n")
     assert told() != version.SOURCE
 

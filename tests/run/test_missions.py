@@ -25,7 +25,7 @@ MESH = lambda: Workers(mesh=devices.make_mesh(2))  # noqa: E731
         (80 * GIB, 100, Workers, 100),  # all
         (80 * GIB, 32_768, Workers, 16_384),  # sqrt(8192 * 32,768)
         (80 * GIB, 10**6, Workers, 32_768),  # no more pay
-        (8 * GIB, 10**6, Workers, 8_192),  # of 1 MiB each
+        (8 * GIB, 10**6, Workers, 8_120),  # of 1 MiB each and 9 KiB of paths
         (80 * GIB, 10**7, MESH, 65_536),
         (80 * GIB, 32_768, MESH, 23_170),  # sqrt(8192 * 32,768 * 2)
     ],
@@ -34,7 +34,12 @@ def test_as_many_missions_play_side_by_side_as_pay_and_fit(
     memory, total, workers, expected, monkeypatch
 ):
     monkeypatch.setattr(devices, "memory", lambda: memory)
-    assert missions.batch_of(total, workers()) == expected
+    assert missions.batch_of(total, 3, workers()) == expected
+
+
+def test_fewer_missions_of_many_pois_fit(monkeypatch):
+    monkeypatch.setattr(devices, "memory", lambda: 8 * GIB)
+    assert missions.batch_of(10**6, 32) == 4_096  # of 1 MiB each and as much of paths
 
 
 def test_missions_take_the_slots_of_those_that_are_done():
