@@ -35,6 +35,7 @@ from jaxsense.sim import localisation, viewpoints, windows
 from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
+_GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached after a failed look
 STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
 _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
 _PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
@@ -85,7 +86,8 @@ def approach(
     is_here = own.view == num_views
     apart = me.map.apart(me.pose[None, :2], poi, me.modality)[0]
     is_new = models.novelty.to_go(apart, me.modality) <= 0
-    reach = jnp.where(is_new & (own.attempts == 0), jnp.inf, AT_VIEWPOINT)
+    near = jnp.where(own.attempts == 0, jnp.inf, _GOAL_DISTANCE)
+    reach = jnp.where(is_new, near, AT_VIEWPOINT)
     is_there = is_here | (sees & (jnp.linalg.norm(viewpoint - me.pose[:2]) <= reach))
 
     time, is_driving = state.time, own.phase == DRIVING

@@ -12,7 +12,7 @@ import pickle
 import stat
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
@@ -199,6 +199,7 @@ class Program:
         self._compiler, self._monitor = compiler, compiler.monitor
         self._stage, self._name, self._closed = stage, name, closed
         self._places: tuple[jax.sharding.NamedSharding, ...] | None = None
+        self._compiled = Future[Function]()
 
     def compile(
         self,

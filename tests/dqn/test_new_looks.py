@@ -59,15 +59,16 @@ def test_a_robot_goes_round_a_poi_to_where_its_look_is_new(sensor, away, new):
 
 
 def test_it_goes_away_from_the_nearest_earlier_look():
-    (state, _), _ = play(team_of(CAMERA, is_random=False), 0, 0)
-    for side in (0.1, -0.1):
+    mdp = team_of(CAMERA, is_random=False)
+    (state, _), _ = play(mdp, 0, 0)
+
+    @jax.jit
+    def look_again(side):
         seen_from = state.looked_from.at[0, CAMERA, 0, 1].set(side)
-        moved, outcome = mdps.step(
-            jax.random.key(1),
-            team_of(CAMERA, is_random=False),
-            state.replace(looked_from=seen_from),
-            jnp.int32(0),
-        )
+        return mdps.step(jax.random.key(1), mdp, state.replace(looked_from=seen_from), jnp.int32(0))
+
+    for side in (0.1, -0.1):
+        moved, outcome = look_again(side)
         assert np.sign(moved.team.poses[0, 1]) == -np.sign(side)
         assert outcome.reward > 0.49  # the way is not quite straight
 
