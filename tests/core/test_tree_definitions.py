@@ -25,13 +25,9 @@ def paid(reward, gain):
     return reward.of_gain(gain)
 
 
-def wrong_programs(number):
-    rewards = [own_reward(float(value))(0.0) for value in range(number)]
-    return sum(float(paid(reward, 1.0)) != value for value, reward in enumerate(rewards))
-
-
 def test_a_class_that_is_defined_again_runs_its_own_program():
-    assert wrong_programs(12) == 0
+    rewards = [own_reward(float(value))(0.0) for value in range(12)]
+    assert [float(paid(reward, 1.0)) for reward in rewards] == list(range(12))
 
 
 def test_leaves_are_found_by_their_places():

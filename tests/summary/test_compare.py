@@ -9,13 +9,6 @@ from summaries import OTHERS, THIS
 from jaxsense.summary import compare
 
 
-def test_the_interval_is_that_of_student():
-    # 1 and 3: the mean 2, its error 1, and t(.975, 1 degree of freedom) 12.706; 2 and 2 have none.
-    low, high = compare.bounds(np.array([[1.0, 2.0], [3.0, 2.0]]))
-    np.testing.assert_allclose(low, [2 - 12.706, 2], atol=1e-3)
-    np.testing.assert_allclose(high, [2 + 12.706, 2], atol=1e-3)
-
-
 def test_differences_are_taken_arena_by_arena():
     # Of two PoIs: half, both and both right, against none, half and half.
     found = {

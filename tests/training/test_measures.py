@@ -50,14 +50,11 @@ def test_figures_of_the_latent_space_as_worked_by_hand(found):
     shares = {"joint": [1, 1, 1], "camera": [1, 0, 0], "lidar": [0, 0, 1]}
     for name, expected in shares.items():
         np.testing.assert_array_equal(figures["unambiguous"][name], expected)
-
-
-def test_what_a_look_leaves_open_is_as_worked_by_hand(found):
     # Red leaves the classes 1 and 2 open, each 5 / 5 deviations off, a cylinder 0 and 1, each
     # 5 / sqrt(26); only the second look at class 0 leaves too few.
     shares = {"joint": [1, 1, 1], "camera": [1, 1, 1], "lidar": [0.5, 1, 1]}
     for name, expected in shares.items():
-        np.testing.assert_array_equal(found[1]["consistent"][name], expected)
+        np.testing.assert_array_equal(figures["consistent"][name], expected)
 
 
 def test_beliefs_of_classes_are_means_over_the_bank_that_is_given():
@@ -139,7 +136,7 @@ def test_exact_bayes_reads_the_same_looks():
 
 
 def test_moment_matching_error_as_worked_by_hand():
-    # The components match N(2, 3^2) and N(1, .5^2), see test_gaussian.
+    # The components match N(2, 3^2), with the variance (1 + 9) / 2 + (4 + 4) / 2, and N(1, .5^2).
     # Dimension 1: |3.5 - 2| / 3 + |ln(6/3)| = .5 + .693147; dimension 2: |.9 - 1| / .5 + 0 = .2.
     components = _belief(((0.0, 1.0), (4.0, 1.0)), ((1.0, 0.5), (3.0, 0.5)))
     error = measures.moment_matching_error(_belief((3.5, 0.9), (6.0, 0.5)), components)

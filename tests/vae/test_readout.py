@@ -143,7 +143,3 @@ def test_plausible_classes_lie_within_two_standard_deviations(mean, std, expecte
         tuple(readout.plausible_classes(Belief(jnp.array(mean), jnp.array(std)), CLASS_MEANS))
         == expected
     )
-
-
-def test_moments_have_one_direction_fewer_than_there_are_classes():
-    assert READ.whitening.shape == (4, 2)
