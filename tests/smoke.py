@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from jaxsense import train
-from jaxsense.run.rundir import RunDirectory, _named
+from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings
+from jaxsense.training import stages
 
 SMOKE = ("--preset", "smoke", "--seed", "5", "--quiet")
 MISSION_KEYS = {
@@ -37,9 +38,13 @@ def contents(path):
 
 def save_models(run, models):
     """Saves models in the directory of a run, as if it had trained them."""
-    for name, tree in _named(models, run.settings.config).items():
+
+    def save(name, tree):
         # What a training finds out is NaN before it.
         run.checkpoints.save(name, jax.tree.map(np.nan_to_num, tree))
+
+    sources = stages.sources(run.settings.config)
+    jax.tree.map(save, sources, {part: getattr(models, part) for part in sources})
 
 
 def written_run(path, config, models=None, **settings):

@@ -159,7 +159,6 @@ _MANY = dataclasses.replace(
         shapes=_FOUR_SHAPES,
     ),
     jmvae=dataclasses.replace(_NOISY.jmvae, latent_size=6, samples_per_class=4000),
-    mdp=MdpConfig(reward="nats", look_cost=0.05),
     dqn=DqnConfig(hidden=(64, 64), updates=32, epochs=600),
     team=dataclasses.replace(_NOISY.team, num_pois=(3, 8)),
     evaluation=dataclasses.replace(_NOISY.evaluation, num_repeats=8, num_states=512),

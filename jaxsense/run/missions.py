@@ -24,8 +24,7 @@ from jaxsense.run import devices
 from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import StageError, is_finite
-
-Measured: TypeAlias = dict[str, PyTree[np.ndarray]]
+from jaxsense.summary.compare import Measured
 
 _STAGE = "mission"  # name of the programs in profiles and caches
 _SECOND = "naive"  # whose first mission is recorded as well as that of the first case
@@ -138,7 +137,7 @@ class Ledger:
     def needs_reserve(self) -> bool:
         """Whether missions wait in a part whose reserve is used up."""
         parts = zip(self._waiting, self._reserve, strict=True)
-        return any(bool(waiting) and reserve.max() < 0 for waiting, reserve in parts)
+        return any(waiting and reserve.max() < 0 for waiting, reserve in parts)
 
     def reserve(self) -> Int[np.ndarray, " B"]:
         """Begins a new reserve: `[P * S]` missions. Where a part has fewer, one fills the rest."""
@@ -387,18 +386,13 @@ def _go_on(
     states, records = rollout_batch(keys, scenario, models, slots.states, CHUNK, recorded)
     slots = _Slots(slots.episode, slots.chunks + 1, states)
     first = jax.tree.map(lambda x: x[:recorded], states)
-    return slots, _found(scenario, models, slots), Recording(first, records)
-
-
-def _found(mission: Mission, models: Models, slots: _Slots) -> _Found:
-    """What the host reads of missions."""
-    states, belief = slots.states, slots.states.belief
-    is_finite = jnp.isfinite(belief.mean) & jnp.isfinite(belief.std)
-    return _Found(
+    is_finite = jnp.isfinite(states.belief.mean) & jnp.isfinite(states.belief.std)
+    found = _Found(
         done=states.done,
         steps=states.steps,
         chunks=slots.chunks,
         is_finite=jnp.all(is_finite, axis=(1, 2)),
         has_values=jnp.all(states.robots.target >= 0, axis=1),
-        metrics=jax.vmap(lambda state: measure(mission, models, state))(states),
+        metrics=jax.vmap(lambda state: measure(scenario, models, state))(states),
     )
+    return slots, found, Recording(first, records)

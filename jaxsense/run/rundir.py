@@ -266,22 +266,10 @@ def load(path: Path | str, trust: bool = False) -> tuple[Config, Models]:
     def restore(name: str, shape: PyTree) -> PyTree:
         return jax.device_put(checkpoints.load(name, shape, finite=True))
 
-    shapes = _named(jax.eval_shape(lambda: models.init(jax.random.key(0), config)), config)
-    return config, stages.models({name: restore(name, x) for name, x in shapes.items()}, config)
-
-
-def _named(models: Models, config: Config) -> dict[str, PyTree]:
-    """The parts of the models, by the names of their stages and checkpoints."""
-    detectors = zip(config.modalities, models.detectors, strict=True)
-    q_networks = zip(learners(config), models.q_networks, strict=True)
-    return {
-        **{f"detector_{name}": detector for name, detector in detectors},
-        "best_jmvae": models.jmvae,
-        "novelty": models.novelty,
-        "fusion": models.fusion,
-        "look_values": models.look_values,
-        **dict(q_networks),
-    }
+    shapes = jax.eval_shape(lambda: models.init(jax.random.key(0), config))
+    sources = stages.sources(config)
+    parts = {part: getattr(shapes, part) for part in sources}
+    return config, models.make_models(config, **jax.tree.map(restore, sources, parts))
 
 
 def rewards(

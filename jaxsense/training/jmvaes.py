@@ -13,18 +13,18 @@ from jaxsense.core.types import Belief, Key
 from jaxsense.models import make_in_place, make_jmvae, make_prior, make_readout
 from jaxsense.training import measures
 from jaxsense.training.detections import Detections
-from jaxsense.training.stage import Fit, Stage, Start, fit_stage
+from jaxsense.training.stage import Fit, Stage, fit_stage
 from jaxsense.vae import fusion, jmvae
 from jaxsense.vae.fusion import Filter, InPlace
 
 _EXACT = 0.003  # nats that a readout may lose, a third of what a sound map may
 
 
-def start(config: Config, *, detections: Detections) -> Start:
+def start(config: Config, *, detections: Detections) -> Fit:
     """The fit of a JMVAE to detections."""
     model = make_jmvae(config)
     problem = jmvae.problem(config.jmvae, detections.bank, model)
-    return functools.partial(jmvae.init, model=model), problem
+    return Fit.of_params(functools.partial(jmvae.init, model=model), problem)
 
 
 def best(

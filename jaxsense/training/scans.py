@@ -17,7 +17,7 @@ from jaxsense.core.types import Belief, Key, pytree
 from jaxsense.models import make_encoder, make_frame, make_scan_jmvae
 from jaxsense.sim import sensors
 from jaxsense.training.detections import Shown, Survey, Surveys, detector_stage, num_training
-from jaxsense.training.stage import Stage, Start
+from jaxsense.training.stage import Fit, Stage
 from jaxsense.vae import frames, leave_one_out
 from jaxsense.vae.detectors import Classifier
 from jaxsense.vae.frames import Scaling
@@ -54,11 +54,11 @@ def views(key: Key, config: Config, *, surveys: Surveys) -> Views:
     return Views(tuple(found), tuple(scalings))
 
 
-def start(config: Config, *, views: Views) -> Start:
+def start(config: Config, *, views: Views) -> Fit:
     """The fit of a JMVAE to views."""
     model = make_scan_jmvae(config)
     problem = leave_one_out.problem(config.jmvae, views.groups, model)
-    return functools.partial(leave_one_out.init, model=model), problem
+    return Fit.of_params(functools.partial(leave_one_out.init, model=model), problem)
 
 
 def _num_scenes(config: Config) -> int:

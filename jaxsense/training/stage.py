@@ -107,6 +107,13 @@ class Fit:
     problem: Callable[[Any], Problem[Any]]
     trained: Callable[[Any, FitState], Output]
 
+    @classmethod
+    def of_params(cls, init: Callable[[Key], Params], problem: Problem[Any]) -> "Fit":
+        """Of parameters alone; the output is these and the loss of the last chunk."""
+        return cls(
+            lambda key: ((), init(key)), lambda _: problem, lambda _, fit: (fit.params, fit.loss)
+        )
+
 
 def fit_stage(name: str, steps: int, fit: Callable[..., Fit]) -> Stage:
     """Makes a stage that fits a network.
@@ -135,22 +142,8 @@ def fit_stage(name: str, steps: int, fit: Callable[..., Fit]) -> Stage:
     return Stage(name, begin, advance, finish, steps, chunks=-(-steps // size))
 
 
-Start = tuple[Callable[[Key], Params], Problem[Any]]
-"""What draws parameters to start from, and the problem that they are fitted to."""
-
-
-def restarts(config: Config, start: Callable[..., Start]) -> list[Stage]:
-    """Makes stages that each train a JMVAE; outputs are parameters and loss of the last chunk.
-
-    Args:
-      start: `(config, **inputs) -> Start`.
-    """
-
-    def fit(config: Config, **inputs: Output) -> Fit:
-        init, problem = start(config, **inputs)
-        trained = lambda _, fit: (fit.params, fit.loss)  # noqa: E731
-        return Fit(lambda key: ((), init(key)), lambda _: problem, trained)
-
+def restarts(config: Config, fit: Callable[..., Fit]) -> list[Stage]:
+    """Makes stages that each train a JMVAE, see `fit_stage`."""
     number = config.jmvae.restarts
     stage = fit_stage("", config.jmvae.steps, fit)
     stage = dataclasses.replace(stage, shares="jmvae", is_optional=number > 1)

@@ -7,6 +7,7 @@ and stops if asked to.
 
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
@@ -156,17 +157,17 @@ def learn(key: Key, config: Config, *, until: str | None = None) -> Learned:
     return Learned(outputs, progress, jnp.stack(finite).all())
 
 
+def sources(config: Config) -> dict[str, str | tuple[str, ...]]:
+    """The stages whose outputs are the trained parts of `Models`, by the names of these."""
+    same = {name: name for name in ("fusion", "novelty", "look_values")}
+    detectors = tuple(f"detector_{name}" for name in config.modalities)
+    networks = agents.learners(config)
+    return {"detectors": detectors, "jmvae": "best_jmvae", "q_networks": networks, **same}
+
+
 def models(outputs: Mapping[str, Output], config: Config) -> Models:
     """Collects the models from the outputs of all stages, by name."""
-    return make_models(
-        config,
-        detectors=tuple(outputs[f"detector_{name}"] for name in config.modalities),
-        jmvae=outputs["best_jmvae"],
-        fusion=outputs["fusion"],
-        novelty=outputs["novelty"],
-        look_values=outputs["look_values"],
-        q_networks=tuple(outputs[name] for name in agents.learners(config)),
-    )
+    return make_models(config, **jax.tree.map(outputs.__getitem__, sources(config)))
 
 
 def mission_key(key: Key) -> Key:
