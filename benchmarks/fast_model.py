@@ -17,6 +17,7 @@ import numpy as np
 from jaxsense import Config, Models, load_pretrained, make_mdp, mission
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.dqn.mdp import Mdp
 from jaxsense.dqn.team import Team
 from jaxsense.looks import Bank
@@ -88,7 +89,7 @@ def predicted(
     )
     classes = jnp.zeros(number, jnp.int32)
     seen = jnp.zeros((number, mdp.num_modalities), bool)
-    start = mdps.begin(jax.random.key(0), mdp, team, classes, classes, seen, features)
+    start = starts.begin(jax.random.key(0), mdp, team, classes, classes, seen, features)
 
     def choose(carry: tuple[mdps.State, jax.Array]) -> tuple[mdps.State, jax.Array]:
         state, taken = carry

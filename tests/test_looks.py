@@ -17,6 +17,7 @@ from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
 from jaxsense.vae import jmvae
@@ -58,7 +59,7 @@ def test_an_mdp_updates_beliefs_by_the_jmvae(models):
     mdp = looks.make_mdp(CONFIG, models, Bank(numbered_bank()))
     assert (mdp.num_pois, mdp.num_classes, mdp.num_modalities, mdp.robots) == (3, 3, 2, (0,))
     seen = jnp.array([[0, 0], [0, 1], [1, 0]], bool)
-    reset = jax.jit(mdps.reset)
+    reset = jax.jit(starts.reset)
     state = reset(jax.random.key(1), mdp, jnp.array([2, 0, 1]), seen)
     np.testing.assert_allclose(state.belief.std[0], np.sqrt(20.0), rtol=1e-6)
     # PoI 1 is of class 0 and was seen by the LiDAR: one of five beliefs.
@@ -77,7 +78,7 @@ def test_an_mdp_is_an_argument_of_jit(models):
     features = tuple(
         jnp.asarray(np.broadcast_to([p, 1 - p], (3, 4, 2)), jnp.float32) for p in (0.5, 0.51)
     )
-    found, reset = [], jax.jit(mdps.reset)
+    found, reset = [], jax.jit(starts.reset)
     posterior = jax.jit(jmvae.posterior, static_argnums=1)
     for number in range(2):
         jmvae_of = jax.tree.map(lambda x, n=number: (1 + n) * x, models.jmvae)
@@ -112,7 +113,9 @@ def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(model
     )
     seen = (jnp.broadcast_to(jnp.array([0.8, 0.2]), (3, 1, 2)),) * 2
     mdp = looks.make_mdp(config, replace(models, fusion=exact_filter()), Bank(seen))
-    state = jax.jit(mdps.reset)(jax.random.key(0), mdp, np.array([1, 1, 1]), np.zeros((3, 2), bool))
+    state = jax.jit(starts.reset)(
+        jax.random.key(0), mdp, np.array([1, 1, 1]), np.zeros((3, 2), bool)
+    )
 
     @jax.jit
     def look(mdp, state, modality):

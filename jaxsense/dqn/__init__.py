@@ -7,7 +7,6 @@ from jaxsense.dqn.mdp import Looks as Looks
 from jaxsense.dqn.mdp import Mdp as Mdp
 from jaxsense.dqn.mdp import Outcome as Outcome
 from jaxsense.dqn.mdp import State as State
-from jaxsense.dqn.mdp import reset as reset
 from jaxsense.dqn.mdp import step as step
 from jaxsense.dqn.optimum import value_iteration as value_iteration
 from jaxsense.dqn.policies import POLICIES as POLICIES
@@ -15,5 +14,6 @@ from jaxsense.dqn.policies import Known as Known
 from jaxsense.dqn.rewards import Nats as Nats
 from jaxsense.dqn.rewards import Paper as Paper
 from jaxsense.dqn.rewards import Reward as Reward
+from jaxsense.dqn.starts import reset as reset
 from jaxsense.dqn.team import Travel as Travel
 from jaxsense.dqn.training import train as train

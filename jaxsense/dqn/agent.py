@@ -10,6 +10,7 @@ from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, Transition, pytree
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.dqn.mdp import Mdp, Outcome, State
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team import Team, Travel, num_features, own_seconds, surroundings
@@ -107,7 +108,7 @@ class Environment:
 
     def reset(self, key: Key) -> Underway:
         """A random first state."""
-        return self.begin(mdps.reset(key, self.mdp))
+        return self.begin(starts.reset(key, self.mdp))
 
     def begin(self, now: State) -> Underway:
         """A first state, in which no robot has set out."""

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxsense.core.types import Fusion, Key, call, pytree
 from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import policies
+from jaxsense.dqn import policies, starts
 from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.optimum import LookValues, steps_of_lattice
 from jaxsense.dqn.policies import Known, Trained
@@ -54,8 +54,8 @@ def reset(
     classes: Int[Array, " N"] | None = None,
     seen: Bool[Array, "N M"] | None = None,
 ) -> Start:
-    """Starts an episode, see `mdp.reset`."""
-    state, looks = mdps.reset_with_looks(key, mdp, classes, seen)
+    """Starts an episode, see `starts.reset`."""
+    state, looks = starts.reset_with_looks(key, mdp, classes, seen)
     total = jnp.zeros((mdp.num_pois, mdp.num_classes))
     for m, features in enumerate(looks):
         of_pois = jax.vmap(lambda x: exact.log_likelihoods(x, m))(features)  # noqa: B023
@@ -231,7 +231,7 @@ def expected_rewards(key: Key, mdp: Mdp, num_draws: int = _NUM_DRAWS) -> Float[A
         bits = (code >> jnp.arange(mdp.num_modalities) & 1).astype(bool)
         seen = jnp.broadcast_to(bits, (mdp.num_pois, mdp.num_modalities))
         classes = jnp.full(mdp.num_pois, poi_class)
-        state = mdps.reset(reset_key, mdp, classes, seen)
+        state = starts.reset(reset_key, mdp, classes, seen)
         return mdps.step(look_key, mdp, state, jnp.int32(0))[1].reward
 
     # Along one axis: one `vmap` in another takes three times as long to compile.

@@ -18,7 +18,7 @@ from jaxsense import dqn
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
-from jaxsense.dqn import episodes, policies
+from jaxsense.dqn import episodes, policies, starts
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.episodes import Start
@@ -111,7 +111,7 @@ class Environment:
     def reset(self, key: Key) -> tuple[Float[Array, " S"], State]:
         """Starts an episode: the observation, and the state."""
         require_32_bits()
-        state = mdps.reset(key, self.mdp)
+        state = starts.reset(key, self.mdp)
         return self.observe(state), state
 
     def observe(self, state: State) -> Float[Array, " S"]:

@@ -16,9 +16,10 @@ from jaxsense.core.types import Fusion, Index, Key
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.episodes import Start, reference
-from jaxsense.dqn.mdp import Mdp, random_start
+from jaxsense.dqn.mdp import Mdp
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known, Values
+from jaxsense.dqn.starts import random_start
 from jaxsense.looks import Bank, mdp_of_one
 from jaxsense.models import Models, make_bayes, make_models
 from jaxsense.training.detections import Detections

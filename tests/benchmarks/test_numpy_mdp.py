@@ -9,6 +9,7 @@ from benchmarks.dqn import untrained_task
 from benchmarks.peers.numpy_mdp import NumpyMdp
 from jaxsense.config import DqnConfig
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.dqn.agent import observation
 
 pytestmark = pytest.mark.slow
@@ -25,7 +26,7 @@ def task():
 def test_every_step_equals_ours(task, modality):
     mdp = task.mdp
     step = jax.jit(lambda key, state, a: mdps.step(key, mdp.of(modality), state, a))
-    reset = jax.jit(lambda key, classes, seen: mdps.reset(key, mdp, classes, seen))
+    reset = jax.jit(lambda key, classes, seen: starts.reset(key, mdp, classes, seen))
     observed = jax.jit(observation)
     theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, modality)
     rng = np.random.default_rng(0)

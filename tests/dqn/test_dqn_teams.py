@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from toys import PLACES, TRAVEL, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.dqn.team import Team, Travel
 
 NOP, CAMERA, LIDAR = 3, 0, 1
@@ -28,7 +29,7 @@ def make_mdp(mapped=None, places=PLACES, robots=(0, 1), **config):
 MDP = make_mdp()
 
 
-reset = jax.jit(mdps.reset)
+reset = jax.jit(starts.reset)
 
 
 def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
@@ -69,7 +70,7 @@ def play(state, *actions):
 
 @jax.jit
 def reset_all(keys, mdp):
-    return jax.vmap(lambda key: mdps.reset(key, mdp))(keys)
+    return jax.vmap(lambda key: starts.reset(key, mdp))(keys)
 
 
 def resets(**given):
@@ -227,7 +228,7 @@ def test_an_episode_of_a_given_team_has_these_robots_and_no_other():
     # It is never alone.
     np.testing.assert_array_equal(state.team.positions, PLACES)
     with pytest.raises(ValueError, match="robots = 2: must be a whole number from 0 to 1"):
-        mdps.reset(jax.random.key(0), make_mdp(robots=(0, 2, 0, 0)))
+        starts.reset(jax.random.key(0), make_mdp(robots=(0, 2, 0, 0)))
 
 
 def test_the_only_robot_of_a_team_may_have_any_sensor():

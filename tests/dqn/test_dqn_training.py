@@ -11,8 +11,7 @@ import pytest
 from toys import ONCE_Q, ONCE_SEEN, agent_of, paying_once_mdp
 
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import replay, training
+from jaxsense.dqn import replay, starts, training
 from jaxsense.dqn.agent import Environment
 from jaxsense.dqn.team import alone
 
@@ -55,7 +54,7 @@ LEARNING = learning_in(MDP, SMALL)
 
 def states():
     classes = jnp.zeros(2, int)
-    reset = lambda seen: mdps.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
+    reset = lambda seen: starts.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
     return jax.jit(jax.vmap(reset))(ONCE_SEEN)
 
 
@@ -218,7 +217,7 @@ def test_values_after_an_action_are_those_of_the_target_network(monkeypatch):
 
     @jax.jit
     def begin():
-        one = mdps.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
+        one = starts.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
         prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), learning.begin(one))
         return prepared, training.init(jax.random.key(0), learning, config, prepared)
 

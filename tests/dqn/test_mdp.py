@@ -11,6 +11,7 @@ from toys import classes_mdp, noisy_mdp
 
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 from jaxsense.dqn.agent import observation
 from jaxsense.dqn.rewards import Paper
 
@@ -23,7 +24,7 @@ SEEN = jnp.array([[False, False], [True, False], [True, True]])
 
 @jax.jit
 def reset(key, classes, seen):
-    return mdps.reset(key, MDP, classes, seen)
+    return starts.reset(key, MDP, classes, seen)
 
 
 @jax.jit
@@ -113,7 +114,7 @@ def test_a_step_is_rewarded_by_the_reward_of_its_mdp():
     # PoI 0 unseen, of class 0: 2 - 0. PoI 1 of class 1, seen by the camera: 12 - 10. Of PoI 2 in
     # class 2, seen by the LiDAR, no more is left.
     seen = jnp.array([[0, 0], [1, 0], [0, 1]], bool)
-    state = mdps.reset(jax.random.key(0), mdp, CLASSES, seen)
+    state = starts.reset(jax.random.key(0), mdp, CLASSES, seen)
     for action, expected in ((0, 1.5), (1, 1.5), (2, -0.5), (NOP, 0.0)):
         _, outcome = mdps.step(jax.random.key(0), mdp.of(1), state, jnp.int32(action))
         assert outcome.reward == expected
@@ -188,7 +189,7 @@ ORDERS = jnp.array(list(itertools.permutations(range(3))))
 @pytest.mark.parametrize("mdp", [MDP, noisy_mdp()], ids=["classes", "noisy"])
 @pytest.mark.parametrize("modality", [0, 1])
 def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
-    state = mdps.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
+    state = starts.reset(jax.random.key(0), mdp, jnp.array([2, 0, 1]), SEEN)
 
     def both_ways(order, action):
         # PoI n of the permuted state is PoI order[n] of the other.
@@ -208,7 +209,7 @@ def test_permuting_pois_permutes_what_a_step_does(mdp, modality):
 @pytest.fixture(scope="module")
 def many_starts():
     keys = jax.random.split(jax.random.key(0), 12_400)
-    classes, seen = jax.jit(jax.vmap(lambda key: mdps.random_start(key, MDP)))(keys)
+    classes, seen = jax.jit(jax.vmap(lambda key: starts.random_start(key, MDP)))(keys)
     return np.asarray(classes), np.asarray(seen)
 
 

@@ -11,6 +11,7 @@ from toys import PLACES, TRAVEL, Certain, Fixed, Toy, make_mdp, team_mdp_of
 from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import mdp as mdps
+from jaxsense.dqn import starts
 
 CAMERA, LIDAR = range(2)
 # Two looks of the camera from one place are worth 1 + 1 / 4; those of the LiDAR are all new.
@@ -37,7 +38,7 @@ def team_of(*robots, **given):
 def play(mdp, *actions):
     """States and outcomes after each of some actions."""
     step = jax.jit(lambda state, action: mdps.step(jax.random.key(1), mdp, state, action))
-    state, found = jax.jit(mdps.reset)(jax.random.key(0), mdp), []
+    state, found = jax.jit(starts.reset)(jax.random.key(0), mdp), []
     for action in actions:
         state, outcome = step(state, jnp.int32(action))
         found.append((state, outcome))
@@ -98,7 +99,7 @@ def test_looks_of_a_robot_alone_are_all_new():
 
 def test_looks_before_the_start_were_in_view_of_their_pois():
     seen = jnp.array([[True, False], [False, False], [True, True]])
-    state = mdps.reset(jax.random.key(3), team_of(CAMERA, LIDAR), jnp.zeros(3, jnp.int32), seen)
+    state = starts.reset(jax.random.key(3), team_of(CAMERA, LIDAR), jnp.zeros(3, jnp.int32), seen)
     apart = np.linalg.norm(state.looked_from - PLACES[:, None, None], axis=-1)
     np.testing.assert_allclose(apart[..., 0][seen], 0.9, rtol=1e-5)
     assert (apart[..., 1:] > 1e5).all()

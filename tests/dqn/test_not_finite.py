@@ -10,7 +10,7 @@ from toys import Certain, Ignorant, Toy, agent_of, classes_mdp, paying_once_mdp,
 
 from jaxsense.config import DqnConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.dqn import episodes, training
+from jaxsense.dqn import episodes, starts, training
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn.agent import Environment
 
@@ -19,7 +19,7 @@ FAST_TO_COMPILE = {"xla_backend_optimization_level": 0}
 
 
 def start(mdp=MDP):
-    return mdps.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
+    return starts.reset(KEY, mdp, jnp.array([0, 1, 2]), jnp.zeros((3, 2), bool))
 
 
 @pytest.mark.parametrize("action", [-1, NOP + 1])

@@ -19,8 +19,7 @@ from toys import (
 )
 
 from jaxsense.config import DqnConfig
-from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import training
+from jaxsense.dqn import starts, training
 from jaxsense.dqn.agent import Agent, Environment
 from jaxsense.dqn.team import alone
 
@@ -143,7 +142,7 @@ def test_a_robot_alone_learns_the_values_worked_by_hand():
     @jax.jit
     @jax.vmap
     def learned(seen):
-        known = mdps.reset(jax.random.key(0), ALONE, jnp.zeros(2, int), seen).belief
+        known = starts.reset(jax.random.key(0), ALONE, jnp.zeros(2, int), seen).belief
         agent = learning_in(ALONE, PROBE).agent
         x = agent.observe(known, alone(2, 0), jnp.ones((1, 2)), jnp.int32(0))
         return agent.q(state.params, x)
