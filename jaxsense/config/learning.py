@@ -119,11 +119,6 @@ class FilterConfig(Section, place="filter"):
 
     steps: int = limited(2000, at_least=1)
 
-    @property
-    def learning_rate(self) -> float:
-        """Initial learning rate of Adam; decays to zero along a cosine."""
-        return 5e-3
-
 
 class MdpConfig(Section, place="mdp"):
     """The map MDP, a Markov decision process whose states are maps of beliefs.

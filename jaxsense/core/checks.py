@@ -23,7 +23,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _MOST_SHOWN = 200  # characters of a value
-_ARRAYS = jax.Array | np.ndarray | np.generic | float | int
+NUMBERS = jax.Array | np.ndarray | np.generic | float | int
+"""What holds one number or several."""
 _Shape = Sequence[int | EllipsisType | None]
 
 
@@ -75,7 +76,7 @@ def require_probabilities(name: str, value: object) -> None:
 def require_shape(name: str, value: object, shape: _Shape) -> None:
     """An array has a shape: None for an axis of any size, `...` at either end for any axes."""
     expected = str(tuple(shape)).replace("None", "any").replace("Ellipsis", "...")
-    if not isinstance(value, _ARRAYS):
+    if not isinstance(value, NUMBERS):
         raise ValueError(f"{name} = {shown(value)}: must be an array of shape {expected}")
     try:
         chex.assert_shape(value, tuple(shape))

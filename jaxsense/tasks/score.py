@@ -23,7 +23,6 @@ from jaxsense.dqn.policies import best
 from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, fixed_draws, key_of_seed
 
-_NUMBERS = jax.Array | np.ndarray | np.generic | float | int
 _UNTRACEABLE = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -257,7 +256,7 @@ def _player(policy: Policy | Recurrent) -> Callable[[Key, Task, int], float]:
         require_function("policy", act, 2, _IS_POLICY)
         act = Partial(_forget, act)
     play = functools.partial(_play_compiled, act)
-    if not all(isinstance(leaf, _NUMBERS) for leaf in jax.tree.leaves(act)):
+    if not all(isinstance(leaf, checks.NUMBERS) for leaf in jax.tree.leaves(act)):
         # A program of its own, which goes when the policy does.
         play = jax.jit(functools.partial(_play, act), static_argnums=3)
 
@@ -295,7 +294,7 @@ def _choose(
         raise ValueError("policy: must return an action and a memory")
     action, after = found
     form = type(action).__name__
-    if isinstance(action, _NUMBERS):
+    if isinstance(action, checks.NUMBERS):
         action = jnp.asarray(action)
         form = f"{action.dtype}{[*action.shape]}"
     if not isinstance(action, jax.Array) or action.shape or action.dtype.kind not in "iu":

@@ -36,6 +36,7 @@ from jaxsense.vae.readout import Readout
 
 _MIN_FEATURE = 1e-6
 _LOOKS, _BATCH = 6, 256  # of each history, histories of each step
+_LEARNING_RATE = 5e-3  # of the filter, in the first step
 
 Drawn = tuple[jax.Array, jax.Array, tuple[jax.Array, ...]]
 """Classes `[steps, B]`, sensors `[steps, T, B]`, and for each modality `[steps, D_m, T, B]`."""
@@ -251,4 +252,4 @@ def filtering(config: FilterConfig, untrained: Filter, bank: Samples) -> Problem
         p, q = ((x.mean, 2 * jnp.log(x.std)) for x in (truth, beliefs))
         return jnp.mean(gaussian.kl_divergence(*p, *q))
 
-    return Problem(config.steps, config.learning_rate, draw, loss)
+    return Problem(config.steps, _LEARNING_RATE, draw, loss)
