@@ -50,8 +50,8 @@ class World:
         self.camera, self.lidar = self.world.sensors
         self.mission = mission.make_mission(SMOKE)
         self.classes = jnp.array([0, 1, 2])
-        layout = sim.random_layout(self.key, SMOKE.arena, self.classes)
-        light = random_light(self.key)
+        layout = jax.jit(sim.random_layout)(self.key, SMOKE.arena, self.classes)
+        light = jax.jit(random_light)(self.key)
         self.scene = sim.Scene(layout, light, jnp.zeros((2, 3)))
         classes = Belief(jnp.eye(3)[:, :2], jnp.ones((3, 2)))
         prior = vae.prior(self.model, 20.0)

@@ -12,7 +12,7 @@ from jaxsense import dqn, tasks
 from jaxsense.config import ConfigError
 from jaxsense.tasks import registry
 from jaxsense.tasks.score import estimate
-from jaxsense.tasks.task import Task
+from jaxsense.tasks.task import EPISODES, Task
 
 NAME = "map-v0"
 
@@ -38,13 +38,6 @@ def test_a_random_policy_reaches_what_the_random_reference_does(of_uniform):
     assert of_uniform.best == "optimal"
 
 
-def random_of_eight():
-    """Return of the random reference in eight episodes, played without the others."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Task, "references", ("random",))
-        return registry.reference_returns(jaxsense.make(NAME), 1, 8)["random"]
-
-
 SETTINGS = {
     "jax_threefry_partitionable": False,
     "jax_random_seed_offset": 1,
@@ -52,18 +45,20 @@ SETTINGS = {
 }
 
 
-def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform):
-    of_eight, usual = random_of_eight(), {name: getattr(jax.config, name) for name in SETTINGS}
+def test_a_score_does_not_depend_on_settings_of_random_numbers(of_uniform, monkeypatch):
+    usual, task = {name: getattr(jax.config, name) for name in SETTINGS}, jaxsense.make(NAME)
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
     try:
         found = jaxsense.score(NAME, [uniform])
-        played = random_of_eight()
+        monkeypatch.setattr(Task, "references", ("random",))  # the others take time
+        played = registry.reference_returns(task, 1, EPISODES)["random"]
     finally:
         for name, value in usual.items():
             jax.config.update(name, value)
     np.testing.assert_array_equal(found.returns, of_uniform.returns[:1])
-    np.testing.assert_array_equal(played, of_eight)
+    # Of 1,024 episodes one or two may round otherwise than where they were stored.
+    np.testing.assert_allclose(played, task.returns[-1, :1], atol=2e-3)
 
 
 def with_reward(task, reward):

@@ -51,13 +51,15 @@ def inputs_of(name, config, outputs):
 def learn_by_stages(key, config, until):
     """As `learn`, but each stage in a program of its own: one for all takes XLA twice as long."""
     outputs, finite = {}, []
+    with_check = lambda output: (output, is_finite(output))  # noqa: E731
 
     def drive(stage, **inputs):
         if until in outputs:
             return None
-        outputs[stage.name] = jax.jit(lambda x: scan(key, config, stage, x)[0])(inputs)
-        finite.append(is_finite(outputs[stage.name]))
-        return outputs[stage.name]
+        output, okay = jax.jit(lambda x: with_check(scan(key, config, stage, x)[0]))(inputs)
+        outputs[stage.name] = output
+        finite.append(okay)
+        return output
 
     training.stages.train(drive, config)
     return training.stages.Learned(outputs, {}, jnp.stack(finite).all())

@@ -1,4 +1,4 @@
-"""The filter: its algebra by hand, its learning against exact Bayes."""
+"""The filter: its algebra and exact Bayes by hand, its learning against exact Bayes."""
 
 import dataclasses
 import functools
@@ -13,7 +13,8 @@ from exact_filter import LABELS, PRIOR, exact_filter, untrained_filter
 
 from jaxsense.config.learning import FilterConfig
 from jaxsense.core import supervised
-from jaxsense.vae import fusion
+from jaxsense.core.types import Belief
+from jaxsense.vae import fusion, gaussian
 from jaxsense.vae.readout import Bayes
 
 NOBODY = np.zeros(2, bool)
@@ -38,6 +39,18 @@ def bank(key, size):
         first = jax.nn.sigmoid(2 * separation * x + prior)
         looks.append(jnp.stack([first, 1 - first], axis=-1))
     return tuple(looks)
+
+
+def test_product_of_experts_by_hand():
+    of = lambda mean, std: Belief(jnp.array([mean]), jnp.array([std]))  # noqa: E731
+    prior = of(0.0, 1.0)
+    # Precisions 4 + 4 - 1 = 7, and (4 * 1 + 4 * 3 - 0) / 7.
+    found = gaussian.product_of_experts(of(1.0, 0.5), of(3.0, 0.5), prior)
+    np.testing.assert_allclose(found.mean, [16 / 7], rtol=1e-6)
+    np.testing.assert_allclose(found.std, [7**-0.5], rtol=1e-6)
+    # A look that knows nothing changes nothing.
+    found = gaussian.product_of_experts(of(1.0, 0.5), prior, prior)
+    np.testing.assert_allclose([found.mean[0], found.std[0]], [1.0, 0.5], rtol=1e-6)
 
 
 def test_looks_by_hand():
@@ -74,6 +87,28 @@ def test_looks_come_to_the_same_in_any_order_and_together():
     chex.assert_trees_all_close(together, after(looks[:2]), rtol=1e-5)
 
 
+EXACT = Bayes(jnp.array(LABELS))
+
+
+def test_likelihoods_of_classes_by_hand():
+    # Of three classes one is green and two are red: .2 / (1/3) = .6 and .8 / (2/3) = 1.2.
+    found = EXACT.log_likelihoods(jnp.array([0.8, 0.2]), 0)
+    np.testing.assert_allclose(np.exp(found), [0.6, 1.2, 1.2], rtol=1e-6)
+    # One cube and two cylinders; what the detector rules out keeps a chance of 1e-12.
+    found = EXACT.log_likelihoods(jnp.array([1.0, 0.0]), 1)
+    np.testing.assert_allclose(np.exp(found), [1.5, 1.5, 3e-12], rtol=1e-5)
+
+
+def test_looks_multiply_the_odds_of_classes():
+    look = jnp.array([0.8, 0.2])
+    np.testing.assert_allclose(np.exp(EXACT.prior), [1 / 3] * 3, rtol=1e-6)
+    after = EXACT.update(EXACT.prior, look, 0)
+    np.testing.assert_allclose(np.exp(after), [0.2, 0.4, 0.4], atol=1e-6)
+    # Times .8 / (2/3), .8 / (2/3) and .2 / (1/3): .24, .48 and .24.
+    after = EXACT.update(after, look, 1)
+    np.testing.assert_allclose(np.exp(after), [0.25, 0.5, 0.25], atol=1e-6)
+
+
 TRAINED = FilterConfig(steps=600)
 
 
@@ -94,14 +129,13 @@ def test_a_trained_filter_is_nearly_exact_bayes(trained):
     learned, losses = trained
     assert losses[-50:].mean() < 0.7 * losses[:10].mean()
     looks = bank(jax.random.key(9), 2000)
-    exact = Bayes(jnp.array(LABELS))
 
     def history(true_class, row):
-        belief, log_posterior = PRIOR, exact.prior
+        belief, log_posterior = PRIOR, EXACT.prior
         for modality in (1, 0, 1, 1):
             features = looks[modality][true_class, row]
             belief = learned.update(belief, NOBODY, features, modality)
-            log_posterior = exact.update(log_posterior, features, modality)
+            log_posterior = EXACT.update(log_posterior, features, modality)
             row = row + 500
         return jnp.log(learned.class_probabilities(belief)), log_posterior
 

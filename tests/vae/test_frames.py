@@ -18,6 +18,11 @@ EXTENT = 0.1 * np.sqrt(2)
 PLACES = 1.5 * EXTENT * np.linspace(-1, 1, 64)
 
 
+@jax.jit
+def profile(window):
+    return PROFILE(window)
+
+
 def cylinder(distance, bearing, radius=0.1, wall=3.0):
     """Distances to a cylinder before a wall, as a LiDAR measures them."""
     across = distance * np.sin(ANGLES - bearing)
@@ -28,7 +33,7 @@ def cylinder(distance, bearing, radius=0.1, wall=3.0):
 
 
 def test_a_cylinder_has_the_depth_of_a_circle():
-    found = np.asarray(PROFILE(cylinder(0.5, 0.0)))
+    found = np.asarray(profile(cylinder(0.5, 0.0)))
     inside = np.abs(PLACES) < 0.08
     expected = 0.1 - np.sqrt(0.01 - PLACES[inside] ** 2)
     np.testing.assert_allclose(found[inside] - found[inside].min(), expected, atol=0.006)
@@ -38,14 +43,14 @@ def test_a_cylinder_has_the_depth_of_a_circle():
 
 
 def test_a_profile_is_not_mirrored():
-    found = np.asarray(PROFILE(jnp.where(ANGLES > 0, 0.5, 0.55)))  # 5 cm deeper to the right
+    found = np.asarray(profile(jnp.where(ANGLES > 0, 0.5, 0.55)))  # 5 cm deeper to the right
     left, right = (found[(x > 0.02) & (x < 0.08)].mean() for x in (PLACES, -PLACES))
     assert right - left == pytest.approx(0.05, abs=0.005)
 
 
 @pytest.mark.parametrize(("distance", "bearing"), [(0.4, 0.0), (0.8, 0.1), (1.1, -0.1)])
 def test_distance_and_bearing_are_taken_out(distance, bearing):
-    usual, found = PROFILE(cylinder(0.5, 0.0)), PROFILE(cylinder(distance, bearing))
+    usual, found = profile(cylinder(0.5, 0.0)), profile(cylinder(distance, bearing))
     inside = np.abs(PLACES) < 0.08
     np.testing.assert_allclose(found[inside], usual[inside], atol=0.012)
     assert np.abs(cylinder(distance, bearing) - cylinder(0.5, 0.0)).max() > 1
@@ -74,7 +79,7 @@ def test_the_front_is_sought_as_far_as_the_bearing_may_be_wrong():
     near_only = frames.profile(ANGLES, EXTENT, 0.0)
     # A pole 2 cm wide at .108 rad, beyond .1 and within .1 and a bearing error of 1 degree.
     window = cylinder(1.0, 0.108, radius=0.01)
-    assert np.asarray(PROFILE(window)).max() > 2 * EXTENT  # the pole, with nothing to its sides
+    assert np.asarray(profile(window)).max() > 2 * EXTENT  # the pole, with nothing to its sides
     assert np.asarray(near_only(window)).max() < 0  # the wall behind
 
 
@@ -83,7 +88,7 @@ def test_what_stands_around_a_poi_does_not_turn_the_profile():
     alone = cylinder(0.5, 0.0)
     aside = jnp.where((ANGLES > 0.25) & (ANGLES < 0.35), 0.8, alone)  # 0.3 m behind
     inside = np.abs(PLACES) < 0.08
-    np.testing.assert_allclose(PROFILE(aside)[inside], PROFILE(alone)[inside], atol=1e-6)
+    np.testing.assert_allclose(profile(aside)[inside], profile(alone)[inside], atol=1e-6)
     alone = cylinder(1.0, 0.0)
     far = jnp.where(ANGLES > 0.3, 1.0, alone)  # as near as the PoI, but 0.3 m to its side
-    np.testing.assert_allclose(PROFILE(far)[inside], PROFILE(alone)[inside], atol=1e-6)
+    np.testing.assert_allclose(profile(far)[inside], profile(alone)[inside], atol=1e-6)

@@ -8,7 +8,7 @@ from plain import dense, encode, looks, random_params
 from scipy.stats import multivariate_normal
 
 from jaxsense.config import JmvaeConfig
-from jaxsense.vae import jmvae
+from jaxsense.vae import gaussian, jmvae
 from jaxsense.vae.jmvae import Jmvae
 
 TWO = Jmvae(("camera", "lidar"), (2, 2), latent_size=2, hidden=(8,))
@@ -50,6 +50,15 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     # KL(N(0, 1) || N(m, v)) = (1/v + m^2/v - 1 + ln v) / 2 for camera and LiDAR, 0 for the sonar.
     expected = (2 + 2 - 1 - np.log(2)) / 2 + (4 + 36 - 1 - np.log(4)) / 2
     np.testing.assert_allclose(parts["subsets"], [expected], rtol=1e-5)
+
+
+def test_a_product_with_what_knows_nothing_stays_as_it_is():
+    means, log_vars = jnp.array([[1.0]]), jnp.log(jnp.array([[0.5]]))
+    # One alone stays as it is, and one wider than the prior takes nothing away from another.
+    np.testing.assert_allclose(gaussian.product(means, log_vars), ([1.0], [-np.log(2)]))
+    mean, log_var = gaussian.product(jnp.array([[1.0], [0.0]]), jnp.log(jnp.array([[0.5], [9.0]])))
+    np.testing.assert_allclose(mean, [1.0], rtol=1e-6)
+    np.testing.assert_allclose(log_var, [-np.log(2)], rtol=1e-6)
 
 
 def test_beta_falls_by_equal_factors_to_its_last_value():
