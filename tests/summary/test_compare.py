@@ -97,6 +97,9 @@ def test_statistics_are_those_of_student():
     some = compare.statistics([{"a": None, "b": 1.0}, {"a": 2.0, "b": None}, {"a": 2.0}])
     assert some == {"a": None}
     assert compare.statistics([{"a": 3.0}]) == {"a": {"mean": 3.0, "low": None, "high": None}}
+    # Of several numbers, each by itself.
+    bounds = compare.bounds(np.array([[1.0, 2.0], [3.0, 2.0]]))
+    np.testing.assert_allclose(bounds, [[-10.706, 2], [14.706, 2]], atol=1e-3)
 
 
 def test_the_times_of_seeds_add_up():
