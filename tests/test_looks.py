@@ -17,8 +17,7 @@ from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import rewards
-from jaxsense.dqn import starts
+from jaxsense.dqn import rewards, starts
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
 from jaxsense.vae import jmvae
