@@ -30,7 +30,8 @@ if __name__ == "__main__":
     config, trained = jaxsense.load_pretrained("default")  # or `jaxsense.load("runs/...")`
     models, scenario = multiplying(trained), mission.make_mission(config)
     start_key, reset_key, play_key, *keys = jax.random.split(jax.random.key(0), 6)
-    mdp, step = jaxsense.make_mdp(config, models), jax.jit(dqn.step)
+    of_one = dataclasses.replace(config, dqn=dataclasses.replace(config.dqn, task="map"))
+    mdp, step = jaxsense.make_mdp(of_one, models), jax.jit(dqn.step)
     state = dqn.reset(start_key, mdp, seen=jnp.zeros((mdp.num_pois, 2), bool))
     for look, key in enumerate(keys):
         state, outcome = step(key, mdp.of(jnp.int32(look % 2)), state, jnp.int32(0))

@@ -1,5 +1,7 @@
 """A custom policy, in the MDP of one robot and in missions: `python examples/new_policy.py`."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -18,7 +20,7 @@ def widest(key: jax.Array, models: policies.Trained, known: dqn.Known) -> jax.Ar
 if __name__ == "__main__":
     config, models = jaxsense.load_pretrained("noisy")  # or those of `jaxsense.load("runs/...")`
     start_key, play_key = jax.random.split(jax.random.key(0))
-    mdp = jaxsense.make_mdp(config, models)
+    mdp = jaxsense.make_mdp(replace(config, dqn=replace(config.dqn, task="map")), models)
 
     def act(key: jax.Array, known: dqn.Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
         """The action in the MDP, and what is remembered: nothing."""

@@ -91,12 +91,12 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
 
     Args:
       models: from `jaxsense.load` or `jaxsense.init`.
-      looks: how to look at PoIs, for example `Bank(jaxsense.detections(...))`; `Live` by default,
-        so that every look casts a scan in the environment's own arena.
+      looks: how to look at PoIs, for example `Bank(jaxsense.detections(...))`, which a team needs;
+        `Live` by default, so that every look casts a scan in the environment's own arena.
 
     Raises:
       ValueError: if the shapes of `models` or `looks` do not match `config`, `models.fusion` is no
-        `Fusion`, or `Live` looks lie outside the detectors' domains, see `sim.windows.Domain`.
+        `Fusion`, or looks are `Live` of a team or outside the detectors' `sim.windows.Domain`.
     """
     require_fitting(config, models)
     looks = Live(worlds.make_world(config), models.detectors) if looks is None else looks
@@ -105,6 +105,9 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
     if config.dqn.task == "map":
         return mdp
     settings = config.team
+    if isinstance(looks, Live):
+        reason = "must be a Bank with dqn.task = 'team', whose MDP has no scans"
+        raise ValueError(f"looks = Live: {reason}")
     places = Places(
         sides=settings.sides,
         robot_radius=PLANNING_RADIUS,
