@@ -73,7 +73,7 @@ def test_the_optimum_of_a_product_of_experts_is_that_of_looks_which_add_up(examp
 def test_new_policy(capsys):
     told = printed("new_policy", capsys)
     assert re.search(r"one robot: total reward -?\d+\.\d\d, of the first look -?\d+\.\d\d", told)
-    rows = re.findall(r"^  (\w+) +[01]\.\d{3} +\d+\.\d\d +\d+\.\d ", told, re.MULTILINE)
+    rows = re.findall(r"^(\w+) +[01]\.\d{3} +\d+\.\d\d +\d+\.\d ", told, re.MULTILINE)
     assert rows == ["widest", "latent", "auction", "naive", "random"]
 
 

@@ -222,6 +222,7 @@ def test_values_of_looks_have_gradients_in_the_likelihoods(horizon):
     # The lattice has corners, where the entropy has an infinite slope.
     belief = Belief(jnp.zeros(1), jnp.ones(1))
 
+    @jax.jit
     def value(accuracy):
         right, wrong = jnp.log(accuracy), jnp.log(1 - accuracy)
         looks = jnp.array([[[1, 0], [1, 0], [0, 1]], [[0, 1], [0, 1], [1, 0]]])
@@ -231,7 +232,7 @@ def test_values_of_looks_have_gradients_in_the_likelihoods(horizon):
         )
         return found.of_all(jnp.array([0.3, 0.7]), jnp.bool_(True))
 
-    gradient = float(jax.grad(value)(0.8))
+    gradient = float(jax.jit(jax.grad(value))(0.8))
     measured = float(value(0.801) - value(0.799)) / 0.002
     assert gradient == pytest.approx(measured, rel=0.02)
     assert gradient > 0.5

@@ -99,7 +99,8 @@ def test_looks_of_a_robot_alone_are_all_new():
 
 def test_looks_before_the_start_were_in_view_of_their_pois():
     seen = jnp.array([[True, False], [False, False], [True, True]])
-    state = starts.reset(jax.random.key(3), team_of(CAMERA, LIDAR), jnp.zeros(3, jnp.int32), seen)
+    given = team_of(CAMERA, LIDAR), np.zeros(3, np.int32), seen
+    state = jax.jit(starts.reset)(jax.random.key(3), *given)
     apart = np.linalg.norm(state.looked_from - PLACES[:, None, None], axis=-1)
     np.testing.assert_allclose(apart[..., 0][seen], 0.9, rtol=1e-5)
     assert (apart[..., 1:] > 1e5).all()
