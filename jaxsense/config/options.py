@@ -265,7 +265,8 @@ def read(base: T | type[T], argv: list[str]) -> T:
     values, rest = given(base, argv)
     options = [*options_of(base)]
     if rest:
-        raise ConfigError("option", *_unknown(rest, [option.name for option in options]))
+        switches = [f"--no-{option.name[2:]}" for option in options if option.kind is bool]
+        raise ConfigError("option", *_unknown(rest, [*(o.name for o in options), *switches]))
     for option in options:
         if option.default is dataclasses.MISSING and option.path not in values:
             raise ConfigError("option", option.name, f"is missing: {option.help}")
@@ -297,7 +298,9 @@ def _unknown(words: list[str], names: list[str]) -> tuple[str, str]:
     if not word.startswith("-"):
         return word, "unexpected argument: options start with --"
     name = word.partition("=")[0]
-    near = _nearest(name[2:], [each[2:] for each in names if each.startswith("--")])
+    # So that nothing is suggested that switches on what should be off.
+    wanted = f"no-{name[2:].replace('no-', '', 1)}" if "no-" in name else name[2:]
+    near = _nearest(wanted, [each[2:] for each in names if each.startswith("--")])
     return name, f"is unknown; did you mean --{near[0]}?" if near else "is unknown; see --help-all"
 
 

@@ -85,6 +85,7 @@ TRAIN = [
     (["--resume", "full"], "resume = 'full': is not a run directory: it has no config.json"),
     (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),
     (["--team.second-cos", "1"], "; did you mean --team.second-cost?"),
+    (["--mdp.no-partly-seen-starts"], "; did you mean --no-mdp.partly-seen-starts?"),
     (["--team.num-pois", "3"], "option = '--team.num-pois': expected 2 arguments"),
     (
         ["--mdp.partly-seen-starts", "maybe"],
