@@ -36,9 +36,10 @@ from jaxsense.sim import world as worlds
 
 GOAL_ANGLE = 6.0  # degrees, maximum angle to the PoI at which a robot scans it
 _GOAL_DISTANCE = 0.2  # m, at which a viewpoint counts as reached after a failed look
-STUCK_TIME = 6.0  # s without progress, then a robot backs off and tries another viewpoint
+# Times lie between control periods, so that the rounding of a program does not decide.
+STUCK_TIME = 5.95  # s without progress, then a robot backs off and tries another viewpoint
 _PROGRESS = 0.02  # m, minimum shortening of a path that counts as progress
-_PATIENCE = 2.0  # s without progress of another robot, then one that has ended makes room
+_PATIENCE = 1.95  # s without progress of another robot, then one that has ended makes room
 _NEARBY = 1.0  # m, between the centres of two robots
 _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 _MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
@@ -322,18 +323,21 @@ def where_due(
     Args:
       kinds: `[B]` int32; one kind by default.
     """
-    due_kinds = jnp.where(due, kinds, _NO_KIND)
-    total, number = len(due), jnp.sum(due)
+    total = len(due)
     size = min(total, max(_MIN_ROWS, total // 16))
-    order = jnp.argsort(due_kinds)
+    # All that follows reads the results of one sort: XLA may compute `due` once for each use, and a
+    # row at a limit that rounds differently would be due in one place and not in another.
+    due_kinds = jnp.where(due, kinds, _NO_KIND)
+    due_kinds, order = jax.lax.sort_key_val(due_kinds, jnp.arange(total))
+    number = jnp.sum(due_kinds != _NO_KIND)
 
     def advance(carry: tuple[jax.Array, Result]) -> tuple[jax.Array, Result]:
         first, after = carry
         index = first + jnp.arange(size)
-        row = rows_at(order, jnp.minimum(index, total - 1))
-        kind_of = jnp.where(index < number, rows_at(due_kinds, row), _NO_KIND)
+        at = jnp.minimum(index, total - 1)
+        row, kind_of = rows_at(order, at), rows_at(due_kinds, at)
         kind = kind_of[0]
-        is_new = kind_of == kind
+        is_new = (index < total) & (kind_of == kind)
         new = function(jax.tree.map(lambda x: rows_at(x, row), inputs), kind)
         kept = jnp.where(is_new, row, total)  # drops the others
 

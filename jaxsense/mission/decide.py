@@ -30,7 +30,7 @@ from jaxsense.sim import viewpoints
 
 _KEPT, _HEADED_FOR = -1e4, 1e2  # m, larger than any distance
 _DETOUR = 2.0  # m, detour that a robot prefers to a viewpoint occupied by another
-RECOVERY_TIME = 1.0  # s that a robot backs off
+RECOVERY_TIME = 0.95  # s that a robot backs off; between control periods, as in `act`
 AT_VIEWPOINT = 0.05  # m, from a viewpoint within which a robot is there
 _REPEATED = 1e3  # m, above any path, for places from which a look tells little
 

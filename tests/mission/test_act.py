@@ -190,7 +190,7 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     # It wants to a viewpoint on the far side of the PoI.
     patience = act.STUCK_TIME
     start = facing(CAMERA, pose=(-1.3, 0.0, 0.0))  # too far to look
-    still = approach(driving(start, set_robot, 0, patience - 0.1, 0.0), CAMERA)
+    still = approach(driving(start, set_robot, 0, patience - 0.05, 0.0), CAMERA)
     assert still.robots.phase[CAMERA] == DRIVING
     stuck = approach(driving(start, set_robot, 0, patience + 0.2, 0.0), CAMERA)
     assert stuck.robots.phase[CAMERA] == BACKING
