@@ -52,7 +52,8 @@ class Arguments(Checked):
     Attributes:
       settings: The settings that determine the results.
       out: Directory to write, new or empty; by default `runs/DATE-TIME-PRESET`.
-      config: The `config.json` of a run whose preset, seed and settings the new run starts from.
+      config: The `config.json` of a run whose preset, seed and settings the new run starts from, or
+        a `.toml` file of this form, such as a copy of `jaxsense/config/presets/noisy.toml`.
       resume: Directory of a stopped run to continue, with its own settings.
       trust: Trust the `config.json` of `--config` or `--resume`: run the code of custom sensors
         that it names.

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias
@@ -70,7 +71,9 @@ def began(path: Path) -> float:
 
 
 def read_settings(file: Path, trust: bool = False) -> Settings:
-    """Reads a `config.json`; missing settings come from the preset that it names, or `default`.
+    """Reads a `config.json`, or a TOML file of the same form, as those of presets.
+
+    Missing settings come from the preset that it names, or `default`.
 
     Raises:
       ConfigError: if the file cannot be read, a field is unknown or wrong, or if it names custom
@@ -109,10 +112,11 @@ def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
 
 def _read(file: Path, field: str, path: Path) -> Json:
     """The content of a `config.json`; raises `ConfigError` about `field = path`."""
+    form, parse = ("TOML", _parse_toml) if file.suffix == ".toml" else ("JSON", parse_json)
     try:
         # A file that the user names may be a link, that of a run may not lead out of it.
         real = Path(os.path.realpath(file)) if path == file else file
-        if isinstance(content := parse_json(inside.read(real)), dict):
+        if isinstance(content := parse(inside.read(real)), dict):
             return content
         reason = f"{file.name} must hold an object"
     except OSError as error:
@@ -120,8 +124,16 @@ def _read(file: Path, field: str, path: Path) -> Json:
         if path != file and isinstance(error, FileNotFoundError | NotADirectoryError):
             reason = "is not a run directory: it has no config.json"
     except ValueError as error:
-        reason = f"{file.name} is not JSON: {error}"
+        reason = f"{file.name} is not {form}: {error}"
     raise ConfigError(field, str(path), reason)
+
+
+def _parse_toml(content: bytes) -> Json:
+    """Parses TOML; raises `ValueError` if the content is something else."""
+    try:
+        return tomllib.loads(content.decode())
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def _settings_of(content: Json, trust: bool) -> Settings:

@@ -10,7 +10,9 @@ __version__ = "0.4.0"
 """Version of jaxsense."""
 _ROOT = Path(__file__).parents[2]
 _FILES = sorted(
-    path for path in Path(__file__).parents[1].rglob("*") if path.suffix in (".py", ".jinja")
+    path
+    for path in Path(__file__).parents[1].rglob("*")
+    if path.suffix in (".py", ".jinja", ".toml")
 )
 SOURCE = hashlib.sha256(b"".join(path.read_bytes() for path in _FILES)).hexdigest()[:16]
 """Digest of jaxsense, taken at import so that it matches the code that runs."""

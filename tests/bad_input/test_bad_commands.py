@@ -45,8 +45,11 @@ def place(tmp_path, monkeypatch):
         "smoke": b'{"preset": "smoke"}',
         "sensor": b'{"config": {"sensors": {"x": {"make": "a:b"}}}}',
     }
-    for name, text in texts.items():
-        (tmp_path / f"{name}.json").write_bytes(text)
+    tables = {"deep": b"x = " + b"[" * 100_000, "twice": b"seed = 1\nseed = 2", "utf16": b"\xff"}
+    tables |= {"date": b"seed = 2020-01-01", "field": b"[config.dqn]\nepoch = 3"}
+    for ending, files in (("json", texts), ("toml", tables)):
+        for name, text in files.items():
+            (tmp_path / f"{name}.{ending}").write_bytes(text)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -78,6 +81,11 @@ TRAIN = [
     (["--config", "nan.json"], "jmvae.beta = nan: must be a number"),
     (["--config", "float.json"], "seed = 1.0: must be a whole number"),
     (["--config", "field.json"], "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
+    (["--config", "deep.toml"], "deep.toml is not TOML: nested too deeply"),
+    (["--config", "twice.toml"], "twice.toml is not TOML: Cannot overwrite a value"),
+    (["--config", "utf16.toml"], "utf16.toml is not TOML: 'utf-8' codec"),
+    (["--config", "date.toml"], "seed = datetime.date(2020, 1, 1): must be a whole number"),
+    (["--config", "field.toml"], "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
     (["--config", "preset.json"], "preset = 'x': must be one of default, paper"),
     (["--config", "smoke.json", "--preset", "paper"], "has a preset; omit --preset"),
     (["--config", "unknown.json"], "colour = 3: unknown field of a run's config.json"),

@@ -8,7 +8,7 @@ from typing import Literal
 import pytest
 
 from jaxsense import train
-from jaxsense.config import PRESETS, ConfigError, Shape, options
+from jaxsense.config import PRESETS, ConfigError, Shape, options, presets
 from jaxsense.config.options import Positional
 from jaxsense.run.rundir import RunDirectory, Settings
 
@@ -192,3 +192,7 @@ def test_every_kind_of_option_is_read(tmp_path):
     assert (given.seed, given.preset, given.config.robots) == (7, "smoke", None)
     assert given.config.arena == dataclasses.replace(config.arena, side=5.0)
     assert resumed.settings == Settings("smoke", 7, config)
+    # A preset's file, as a user may copy it, changes the preset that it names.
+    file = str(Path(presets.__file__).parent / "many.toml")
+    copied = train.parse(["--config", file, "--seed", "3"])
+    assert copied.settings == Settings("noisy", 3, PRESETS["many"])

@@ -189,7 +189,9 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
     assert not left.exists()
 
 
-@pytest.mark.parametrize("changed", ["vae/gaussian.py", "sim/arena.xml.jinja"])
+@pytest.mark.parametrize(
+    "changed", ["vae/gaussian.py", "sim/arena.xml.jinja", "config/presets/raw.toml"]
+)
 def test_the_source_is_that_of_the_whole_package(tmp_path, changed):
     root = Path(jaxsense.__file__).parent
     shutil.copytree(root, tmp_path / "jaxsense", ignore=shutil.ignore_patterns("*.pyc"))
