@@ -67,6 +67,7 @@ autodoc_mock_imports = [
         "onnxruntime",
         "pettingzoo",
         "rejax",
+        "spox",
         "stable_baselines3",
         "tensorboardX",
         "torch",

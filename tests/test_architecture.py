@@ -27,7 +27,7 @@ SIMULATION = {"mujoco", "scipy", "trimesh"}
 # For commands, pictures and files of others: `jaxsense.make` needs none of them.
 COMMANDS = {
     *("gymnasium", "gymnax", "IPython", "jinja2", "matplotlib", "onnx", "orbax"),
-    *("pandas", "pytest", "tensorboardX", "tensorstore", "tyro"),
+    *("pandas", "pytest", "spox", "tensorboardX", "tensorstore", "tyro"),
 }
 
 

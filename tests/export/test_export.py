@@ -31,7 +31,7 @@ import resampling
 import run_exported
 run_exported.main()
 """
-ABSENT = "jaxsense,jax,jaxlib,onnx"
+ABSENT = "jaxsense,jax,jaxlib,onnx,spox"
 
 
 def run_alone(folder, *arguments, absent=ABSENT, copied=COPIED):
@@ -63,7 +63,7 @@ def test_the_example_names_what_is_missing(tmp_path, absent, copied, expected):
     assert done.stderr.endswith(f"{expected}\n")
 
 
-@pytest.mark.parametrize("package", ["onnx", "onnxruntime"])
+@pytest.mark.parametrize("package", ["onnx", "onnxruntime", "spox"])
 def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch, capsys, package):
     monkeypatch.setitem(sys.modules, package, None)
     for name in ("robot", "translate"):

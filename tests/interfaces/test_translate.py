@@ -18,7 +18,7 @@ INDICES = np.int32([1, 0])
 
 def translated(function, **inputs):
     structs = {name: jax.ShapeDtypeStruct(*each) for name, each in inputs.items()}
-    return program("test", lambda models, *x: {"y": function(*x)}, WEIGHTS, structs)[0]
+    return program("test", lambda _, *x: {"y": function(*x)}, WEIGHTS, structs)[0]
 
 
 def check(function, *given, shapes=((N, 3), (K,)), also=()):
@@ -135,6 +135,8 @@ def from_the_end(x):
         (lambda x: x.at[0, jnp.argmax(x[0])].get(mode="fill", fill_value=0.0), "gather that fills"),
         (lambda x: x.at[x[:, 0].astype(jnp.int32)].set(0.0), "scatter of several rows"),
         (from_the_end, "a scan from the end"),
+        (lambda x: x.astype(jnp.int32) & 1, "the primitive and of int32"),
+        (lambda x: x + jax.random.normal(jax.random.key(0), (1, 3)), "the primitive"),
     ],
 )
 def test_what_has_no_translation_is_refused(function, reason):
