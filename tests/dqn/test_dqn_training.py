@@ -52,6 +52,24 @@ SMALL = DqnConfig(
 LEARNING = learning_in(MDP, SMALL)
 
 
+@jax.jit
+def begin(init_key, start_key, learning, config):
+    prepared = training.starts(start_key, learning, config)
+    return prepared, training.init(init_key, learning, config, prepared)
+
+
+def chunk_of(learning, config, prepared):
+    """The state and the infos after a chunk."""
+    chunk = functools.partial(training.train_chunk, jax.random.key(1), learning, config)
+    return jax.jit(lambda state: chunk(state, prepared), compiler_options=FAST_TO_COMPILE)
+
+
+def with_bias(params, bias):
+    """A network whose values are the same for every state."""
+    layers = jax.tree.map(jnp.zeros_like, params["params"])
+    return {"params": {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array(bias)}}}
+
+
 def states():
     classes = jnp.zeros(2, int)
     reset = lambda seen: starts.reset(jax.random.key(0), MDP, classes, seen)  # noqa: E731
@@ -96,13 +114,7 @@ def chunks():
     """States of a small training after every epoch, and the infos, stepped from the host."""
     config = SMALL
     init_key, start_key, chunk_key = jax.random.split(jax.random.key(0), 3)
-
-    @jax.jit
-    def begin():
-        prepared = training.starts(start_key, LEARNING, config)
-        return prepared, training.init(init_key, LEARNING, config, prepared)
-
-    prepared, first = begin()
+    prepared, first = begin(init_key, start_key, LEARNING, config)
 
     @chex.assert_max_traces(n=1)  # a second chunk must not be traced again
     def chunk(key, state):
@@ -115,6 +127,13 @@ def chunks():
         all_states.append(state)
         infos.append(info)
     return all_states, jax.tree.map(lambda *x: jnp.concatenate(x), *infos)
+
+
+def test_an_update_draws_as_many_blocks_as_make_a_batch():
+    config = replace(PROBE, num_envs=128, batch=256)  # in 64 blocks
+    keys = jax.random.split(jax.random.key(0), 3)
+    draws = jax.eval_shape(lambda keys: training._draw(keys, config), keys)
+    assert draws.replay.shape == (config.chunk, 2, 64, 2)
 
 
 def test_epsilon_falls_by_its_factor_every_epoch_down_to_the_floor(chunks):
@@ -165,21 +184,9 @@ def test_an_episode_goes_on_until_nop_or_the_cut(monkeypatch):
     )
 
     learning = learning_in(mdp, config)
-
-    @jax.jit
-    def begin():
-        prepared = training.starts(jax.random.key(2), learning, config)
-        return prepared, training.init(jax.random.key(0), learning, config, prepared)
-
-    prepared, state = begin()
-    layers = state.params["params"]
-    layers = {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array([1e3, -1e3])}}
-    state = replace(state, params={"params": layers})
-    chunk = jax.jit(
-        lambda state: training.train_chunk(jax.random.key(1), learning, config, state, prepared),
-        compiler_options=FAST_TO_COMPILE,
-    )
-    infos = []
+    prepared, state = begin(jax.random.key(0), jax.random.key(2), learning, config)
+    state = replace(state, params=with_bias(state.params, [1e3, -1e3]))
+    chunk, infos = chunk_of(learning, config, prepared), []
     for _ in range(config.epochs // config.chunk):
         state, info = chunk(state)
         infos.append(info)
@@ -198,12 +205,6 @@ def test_an_episode_goes_on_until_nop_or_the_cut(monkeypatch):
     assert set(np.asarray(drawn.a_tm1)) == {0}
 
 
-def with_bias(params, bias):
-    """A network whose values are the same for every state."""
-    layers = jax.tree.map(jnp.zeros_like, params["params"])
-    return {"params": {**layers, "Dense_1": {**layers["Dense_1"], "bias": jnp.array(bias)}}}
-
-
 def test_values_after_an_action_are_those_of_the_target_network(monkeypatch):
     monkeypatch.setattr(training, "_FIRST_EPSILON", 0.0)
     # Nothing is left to see: every look costs 1, and the policy looks at PoI 0 for ever.
@@ -216,21 +217,18 @@ def test_values_after_an_action_are_those_of_the_target_network(monkeypatch):
     learning = learning_in(mdp, config)
 
     @jax.jit
-    def begin():
+    def begin_there():
         one = starts.reset(jax.random.key(0), mdp, jnp.zeros(1, int), seen)
         prepared = jax.tree.map(lambda x: jnp.stack([x] * config.num_starts), learning.begin(one))
         return prepared, training.init(jax.random.key(0), learning, config, prepared)
 
-    prepared, state = begin()
+    prepared, state = begin_there()
     state = replace(
         state,
         params=with_bias(state.params, [1.0, 0.0]),
         target=with_bias(state.params, [-2.0, 3.0]),
     )
-    chunk = jax.jit(
-        lambda state: training.train_chunk(jax.random.key(1), learning, config, state, prepared),
-        compiler_options=FAST_TO_COMPILE,
-    )
+    chunk = chunk_of(learning, config, prepared)
     state, first = chunk(state)
     _, second = chunk(state)
     # The value of the look is 1. By the target -1 + .5 x max(-2, 3) - 1 = -.5, and from its first
@@ -271,31 +269,20 @@ def test_the_policy_is_evaluated_after_every_tenth_epoch():
 Q_TM1, Q_T = jnp.array([1.0, 2.0, 3.0]), jnp.array([-1.0, 4.0, 0.0])
 
 
-def td_error(q_tm1, q_t, action=1, discount=0.9):
-    return training.td_error(q_tm1, jnp.int32(action), jnp.float32(0.5), jnp.float32(discount), q_t)
-
-
-def test_td_error_as_worked_by_hand():
-    # .5 + .9 x max(-1, 4, 0) - 2 = 2.1; for action 2, .5 + 3.6 - 3 = 1.1.
-    np.testing.assert_allclose(td_error(Q_TM1, Q_T), 2.1, rtol=1e-6)
-    np.testing.assert_allclose(td_error(Q_TM1, Q_T, action=2), 1.1, rtol=1e-6)
+def test_td_errors_as_worked_by_hand():
+    # .5 + .9 x max(-1, 4, 0) - 2 = 2.1; for action 2, .5 + 3.6 - 3 = 1.1; at an end, .25 - 1.
+    q_tm1, q_t = (jnp.stack([q] * 3, axis=1) for q in (Q_TM1, Q_T))
+    discounts, rewards = jnp.array([0.9, 0.9, 0.0]), jnp.array([0.5, 0.5, 0.25])
+    found = training.td_error(q_tm1, jnp.array([1, 2, 0]), rewards, discounts, q_t)
+    np.testing.assert_allclose(found, [2.1, 1.1, -0.75], rtol=1e-6)
 
 
 def test_no_gradient_flows_into_the_target():
-    by_value, by_target = jax.grad(td_error, argnums=(0, 1))(Q_TM1, Q_T)
+    action, r_t, discount = jnp.int32(1), jnp.float32(0.5), jnp.float32(0.9)
+    error = lambda q_tm1, q_t: training.td_error(q_tm1, action, r_t, discount, q_t)  # noqa: E731
+    by_value, by_target = jax.grad(error, argnums=(0, 1))(Q_TM1, Q_T)
     np.testing.assert_array_equal(by_value, [0.0, -1.0, 0.0])
     np.testing.assert_array_equal(by_target, [0.0, 0.0, 0.0])
-
-
-def test_td_errors_of_many_transitions_are_those_of_each():
-    keys = jax.random.split(jax.random.key(0), 4)
-    q_tm1, q_t = jax.random.normal(keys[0], (2, 3, 7))
-    actions = jax.random.randint(keys[1], (7,), 0, 3)
-    rewards, discounts = jax.random.uniform(keys[2], (2, 7))
-    together = training.td_error(q_tm1, actions, rewards, discounts, q_t)
-    for i in range(7):
-        alone = training.td_error(q_tm1[:, i], actions[i], rewards[i], discounts[i], q_t[:, i])
-        np.testing.assert_allclose(together[i], alone, rtol=1e-6)
 
 
 def test_pseudo_huber_as_worked_by_hand():

@@ -61,16 +61,20 @@ def test_a_robot_goes_round_a_poi_to_where_its_look_is_new(sensor, away, new):
 
 def test_it_goes_away_from_the_nearest_earlier_look():
     mdp = team_of(CAMERA, is_random=False)
-    (state, _), _ = play(mdp, 0, 0)
+    ((state, _),) = play(mdp, 0)
+    # South-west of the PoI at (1.9, 0), .9 m from it, and a bit to the right of there.
+    place, right = jnp.array([1.36, -0.72]), jnp.array([0.8, -0.6])
 
     @jax.jit
     def look_again(side):
-        seen_from = state.looked_from.at[0, CAMERA, 0, 1].set(side)
-        return mdps.step(jax.random.key(1), mdp, state.replace(looked_from=seen_from), jnp.int32(0))
+        team = state.team.replace(poses=jnp.append(place, 0.0)[None])
+        seen_from = state.looked_from.at[0, CAMERA, 0].set(place + side * right)
+        before = state.replace(looked_from=seen_from, team=team)
+        return mdps.step(jax.random.key(1), mdp, before, jnp.int32(0))
 
     for side in (0.1, -0.1):
         moved, outcome = look_again(side)
-        assert np.sign(moved.team.poses[0, 1]) == -np.sign(side)
+        assert np.sign((moved.team.poses[0, :2] - place) @ right) == -np.sign(side)
         assert outcome.reward > 0.49  # the way is not quite straight
 
 

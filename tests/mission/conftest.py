@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from arenas import arena, known_layout, place, set_native  # noqa: F401
-from teams import CONFIG, alone, decide_alone, starting, with_config, with_eyes
+from teams import AHEAD, CONFIG, alone, decide_alone, starting, with_config, with_eyes
 
 import jaxsense
 from jaxsense import mission
 from jaxsense.mission import act
+from jaxsense.mission.state import FACING
 
 
 @pytest.fixture(scope="session")
@@ -44,6 +45,20 @@ def set_robot():
         return replace(state, robots=replace(state.robots, to_view=to_view))
 
     return change
+
+
+@pytest.fixture(scope="session")
+def facing(arena_of, set_robot):
+    """A robot that turns to a red cube 0.8 m east of the origin."""
+
+    def make(robot, pose=(0.0, 0.0, 0.0), other=(0.0, 1.2, 0.0), faults=None, error=(0.0,) * 3):
+        poses = [pose, other] if robot == 0 else [other, pose]
+        state = arena_of(AHEAD, poses, classes=(2, 0, 1), faults=faults)
+        state = replace(state, pose_error=jnp.zeros((2, 3)).at[robot].set(jnp.array(error)))
+        # It has waited long enough to scan whatever is in the way.
+        return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import AHEAD, CONFIG
+from teams import CONFIG
 
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core.novelty import Novelty
@@ -23,20 +23,8 @@ from jaxsense.mission.state import (
 )
 
 CAMERA, LIDAR = 0, 1
-AWAY = [0.0, 1.2, 0.0]
 IN_THE_VIEW = [0.4, 0.0, 0.0]
-BLIND = Faults(jnp.full(2, jnp.inf), jnp.full(2, 0.0))
-
-
-@pytest.fixture(scope="module")
-def facing(arena_of, set_robot):
-    def make(robot, pose=(0.0, 0.0, 0.0), other=AWAY, faults=None):
-        poses = [list(pose), other] if robot == CAMERA else [other, list(pose)]
-        state = arena_of(AHEAD, poses, classes=(2, 0, 1), faults=faults)
-        # It has waited long enough to scan whatever is in the way.
-        return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
-
-    return make
+BLIND = Faults(np.full(2, np.inf, np.float32), np.zeros(2, np.float32))
 
 
 def sure(models, robot, confidence):
@@ -149,7 +137,8 @@ def test_an_unsure_detector_writes_nothing(scan, models, facing, robot):
 def test_only_a_robot_that_faces_the_poi_and_is_calm_scans(
     scan, facing, set_robot, pose, turning, scans
 ):
-    state = set_robot(facing(CAMERA, pose), CAMERA, command=jnp.array([0.0, turning]))
+    state = facing(CAMERA, pose)
+    state = set_robot(state, CAMERA, command=jnp.array([0.0, turning]), progress_at=0.0)
     after = scan(jax.random.key(0), state, CAMERA)
     assert after.robots.looks[CAMERA] == scans
 
@@ -201,18 +190,32 @@ def test_a_robot_without_progress_backs_off_and_tries_another_viewpoint(
     goes_on = approach(driving(start, set_robot, 0, patience + 0.2, 0.0, path_left=9.0), CAMERA)
     assert goes_on.robots.phase[CAMERA] == DRIVING
     assert goes_on.robots.path_left[CAMERA] < 9.0
+    assert goes_on.robots.progress_at[CAMERA] == goes_on.time
     # And after the time of recovery it asks again.
-    later = patience + 0.2 + act.RECOVERY_TIME + 0.1
-    steps = jnp.int32(round(later / CONTROL_PERIOD))
-    assert approach(replace(stuck, steps=steps), CAMERA).robots.phase[CAMERA] == IDLE
+    for seconds, phase in ((act.RECOVERY_TIME - 0.05, BACKING), (act.RECOVERY_TIME + 0.05, IDLE)):
+        later = replace(stuck, steps=stuck.steps + round(seconds / CONTROL_PERIOD))
+        assert approach(later, CAMERA).robots.phase[CAMERA] == phase
+    # The third failure is the last.
+    last = approach(set_robot(driving(start, set_robot, 0, patience + 0.2, 0.0), 0, attempts=2), 0)
+    np.testing.assert_array_equal(last.robots.unreachable, [[True, False, False], [False] * 3])
 
 
 def test_a_robot_looks_on_the_way_but_after_a_failure_from_the_viewpoint(
     approach, facing, set_robot
 ):
     # It wants to the far side of the PoI, which it sees already.
-    on_the_way = driving(facing(CAMERA), set_robot, 0, 0.1, 0.0)
-    assert approach(on_the_way, CAMERA).robots.phase[CAMERA] == FACING
+    start = facing(CAMERA)
+    on_the_way = driving(start, set_robot, 0, 0.1, 0.0)
+    # Neither that another robot stands at the viewpoint nor that it took long is of importance.
+    there = facing(CAMERA, other=[*start.roadmap.viewpoints[0, 0], 0.0])
+    for state in (on_the_way, driving(there, set_robot, 0, act.STUCK_TIME + 0.2, 0.0)):
+        own = jax.tree.map(lambda x: x[CAMERA], approach(state, CAMERA).robots)
+        assert (own.phase, own.goals, own.reached, own.attempts) == (FACING, 1, 1, 0)
+        assert own.progress_at == state.time
+    # A look from where it stands is no goal.
+    views = on_the_way.robots.excluded.shape[1] - 1
+    stays = approach(set_robot(on_the_way, CAMERA, view=views), CAMERA).robots
+    assert (stays.phase[CAMERA], stays.reached[CAMERA]) == (FACING, 0)
     failed = set_robot(on_the_way, CAMERA, attempts=1)
     assert approach(failed, CAMERA).robots.phase[CAMERA] == DRIVING
 
@@ -242,7 +245,10 @@ def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facin
     assert np.any(approach(state, LIDAR).robots.wanted[LIDAR] != 0)
     backs_off = set_robot(state, CAMERA, phase=BACKING, progress_at=2.5, backs_off_until=9.0)
     assert np.any(approach(backs_off, LIDAR).robots.wanted[LIDAR] != 0)
-    # But not for one that gets on, nor for one that is far away.
+    # But not if it has failed since.
+    stops = replace(state, faults=Faults(jnp.array([jnp.inf, 2.9]), state.faults.blind_at))
+    np.testing.assert_array_equal(approach(stops, LIDAR).robots.wanted[LIDAR], 0.0)
+    # Nor for one that gets on, or that is far away.
     gets_on = set_robot(state, CAMERA, progress_at=2.5)
     np.testing.assert_array_equal(approach(gets_on, LIDAR).robots.wanted[LIDAR], 0.0)
     for place in ([-1.3, 0.0], [0.8, -0.8]):  # the second one is at 1.13 m

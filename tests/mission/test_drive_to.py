@@ -185,51 +185,36 @@ def move(layout, poses, commands, wanted):
     return poses, commands, jnp.min(clearance)
 
 
-@pytest.fixture(scope="module")
-def met():
-    """Two robots that drive at each other, or one at another that stands, in B directions.
+@jax.jit
+@jax.vmap
+def meet(yaw, beside):
+    """Two robots that drive at each other in some direction, one of them beside the other's way.
 
-    How far robot 1 is beside the way of robot 0, paths as seen along it `[B, T, 2, 2]`, distances
-    to the goals `[B, T, 2]`, and the least clearance.
+    Paths as seen along it `[T, 2, 2]`, distances to the goals `[T, 2]`, and the least clearance.
     """
+    turn = jnp.array([[jnp.cos(yaw), -jnp.sin(yaw)], [jnp.sin(yaw), jnp.cos(yaw)]])
+    starts = jnp.array([[-0.9, 0.0], [0.9, 0.0]]) + beside * jnp.array([[0.0, 0.0], [0.0, 1.0]])
+    goals = starts * jnp.array([[-1.0, 1.0]]) @ turn.T
+    yaws, layout = jnp.stack([yaw, yaw + jnp.pi]), layout_of()
+    drive_to = functools.partial(navigation.drive_to, ARENA, layout)
 
-    def meet(yaw, beside, stands):
-        turn = jnp.array([[jnp.cos(yaw), -jnp.sin(yaw)], [jnp.sin(yaw), jnp.cos(yaw)]])
-        starts = jnp.array([[-0.9, 0.0], [0.9, 0.0]]) + beside * jnp.array([[0.0, 0.0], [0.0, 1.0]])
-        goals = starts * jnp.array([[-1.0, 1.0]])
-        starts = jnp.where(stands, starts * jnp.array([[1.0, 1.0], [0.0, 1.0]]), starts)
-        yaws = jnp.stack([yaw, yaw + jnp.pi])
-        goals = goals @ turn.T
+    def step(state, _):
+        wanted = [
+            drive_to(*state, r, goal, PERIOD, jnp.bool_(False)) for r, goal in enumerate(goals)
+        ]
+        poses, commands, clearance = move(layout, *state, jnp.stack(wanted))
+        return (poses, commands), (poses, clearance)
 
-        def step(state, _):
-            poses, commands = state
-            wanted = [
-                navigation.drive_to(
-                    ARENA, layout_of(), poses, commands, r, goal, PERIOD, jnp.bool_(False)
-                )
-                for r, goal in enumerate(goals)
-            ]
-            wanted[1] = jnp.where(stands, 0.0, wanted[1])
-            poses, commands, clearance = move(layout_of(), poses, commands, jnp.stack(wanted))
-            return (poses, commands), (poses, clearance)
-
-        state = jnp.concatenate([starts @ turn.T, yaws[:, None]], axis=-1), jnp.zeros((2, 2))
-        _, (path, clearance) = jax.lax.scan(step, state, length=150)
-        away = jnp.linalg.norm(path[..., :2] - goals[None], axis=-1)
-        return path[..., :2] @ turn, away, clearance.min()
-
-    meet = jax.jit(jax.vmap(meet))
-
-    def run(stands):
-        yaw = np.linspace(-3, 3, 25, dtype=np.float32)
-        beside = np.tile(np.linspace(-0.2, 0.2, 5, dtype=np.float32), 5)
-        return beside, *jax.tree.map(np.array, meet(yaw, beside, np.full(25, stands)))
-
-    return run
+    state = jnp.concatenate([starts @ turn.T, yaws[:, None]], axis=-1), jnp.zeros((2, 2))
+    _, (path, clearance) = jax.lax.scan(step, state, length=150)
+    away = jnp.linalg.norm(path[..., :2] - goals[None], axis=-1)
+    return path[..., :2] @ turn, away, clearance.min()
 
 
-def test_two_robots_that_drive_at_each_other_pass_and_do_not_touch(met):
-    beside, path, away, clearance = met(stands=False)
+def test_two_robots_that_drive_at_each_other_pass_and_do_not_touch():
+    yaw = np.linspace(-3, 3, 25, dtype=np.float32)
+    beside = np.tile(np.linspace(-0.2, 0.2, 5, dtype=np.float32), 5)
+    path, away, clearance = jax.tree.map(np.array, meet(yaw, beside))
     # Planning keeps their middles 2 * 0.1 - 0.005 apart, of which 2 * 0.0495 are the robots.
     assert clearance.min() > 0.09
     # 1.6 m to within 0.2 m at 0.2 m/s take 8 s.

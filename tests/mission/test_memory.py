@@ -15,9 +15,9 @@ from jaxsense.config.mission import CommunicationConfig
 from jaxsense.core import networks
 from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
-from jaxsense.mission import maps
+from jaxsense.mission import act, maps
 from jaxsense.mission.begin import start
-from jaxsense.mission.maps import MOST_LOOKS, Evidence, OwnMap, SharedMap
+from jaxsense.mission.maps import MOST_LOOKS, Evidence, Learned, OwnMap, SharedMap
 from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
@@ -194,6 +194,20 @@ def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
         assert own_team.map_of(after, 1).version == version
     failed = set_robot(replace(state, steps=jnp.int32(10)), 0, phase=FAILED)
     assert own_team.map_of(repeat(failed), 1).version == 0
+
+
+def test_a_robot_remembers_and_tells_what_it_has_detected(own_team, own_arena, set_robot):
+    state = set_robot(own_arena(POSITIONS, POSES), 1, target=2)
+    learned = Learned(Belief(*jnp.ones((2, 2))), jnp.zeros(3), NOTHING)
+    write = jax.jit(lambda state, *found: act._write(own_team, 1, jax.random.key(0), state, *found))
+    after = write(replace(state, steps=jnp.int32(4)), jnp.bool_(True), learned).memory
+    np.testing.assert_array_equal(after.number, [0, 1])
+    assert after.poi[1, 0] == 2
+    np.testing.assert_allclose(after.place[1, 0], POSES[1][:2])
+    # Both at once; of the other robot nobody has heard anything.
+    np.testing.assert_allclose(after.heard_at[:, :, 0], [[np.inf, 0.4]] * 2, rtol=1e-6)
+    missed = write(state, jnp.bool_(False), learned).memory
+    jax.tree.map(np.testing.assert_array_equal, missed, state.memory)
 
 
 @pytest.mark.slow  # compiles a mission twice

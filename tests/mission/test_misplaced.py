@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import AHEAD, CONFIG, POSES, POSITIONS, with_config
+from teams import CONFIG, POSES, POSITIONS, with_config
 
 from jaxsense import mission
 from jaxsense.config.mission import LocalisationConfig, Search
@@ -15,21 +15,6 @@ from jaxsense.mission.rollout import _drift
 from jaxsense.mission.state import DRIVING, FACING, Robot
 
 CAMERA, LIDAR = 0, 1
-AWAY = [0.0, 1.2, 0.0]
-
-
-@pytest.fixture(scope="module")
-def facing(arena_of, set_robot):
-    """A robot at a pose, with an error, that turns to a red cube 0.8 m east of the origin."""
-
-    def make(robot, pose, error):
-        poses = [pose, AWAY] if robot == CAMERA else [AWAY, pose]
-        state = arena_of(AHEAD, poses, classes=(2, 0, 1))
-        errors = jnp.zeros((2, 3)).at[robot].set(jnp.array(error))
-        state = replace(state, pose_error=errors)
-        return set_robot(state, robot, phase=FACING, target=0, progress_at=-100.0)
-
-    return make
 
 
 @pytest.mark.parametrize("robot", [CAMERA, LIDAR])
@@ -45,7 +30,7 @@ def facing(arena_of, set_robot):
 def test_a_robot_scans_where_it_believes_the_poi_to_be(
     scan, facing, robot, degrees, error, looks, detections
 ):
-    state = facing(robot, [0.0, 0.0, np.radians(degrees)], [0.0, 0.0, np.radians(error)])
+    state = facing(robot, [0.0, 0.0, np.radians(degrees)], error=[0.0, 0.0, np.radians(error)])
     robots = scan(jax.random.key(0), state, robot).robots
     assert (robots.looks[robot], robots.detections[robot]) == (looks, detections)
 
@@ -53,14 +38,14 @@ def test_a_robot_scans_where_it_believes_the_poi_to_be(
 def test_a_detector_is_given_the_distance_that_the_robot_believes(scan, facing):
     # The LiDAR's refuses what is 0.24 m nearer than expected.
     for error, detections in ((0.0, 1), (-0.1, 1), (-0.3, 0)):
-        state = facing(LIDAR, [0.0, 0.0, 0.0], [error, 0.0, 0.0])
+        state = facing(LIDAR, error=[error, 0.0, 0.0])
         robots = scan(jax.random.key(0), state, LIDAR).robots
         assert (robots.looks[LIDAR], robots.detections[LIDAR]) == (1, detections)
 
 
 def test_a_robot_that_searches_looks_from_farther_away(team, facing):
     # It is .35 m from the PoI, and looks from .3 m and farther.
-    state = facing(CAMERA, [0.45, 0.0, 0.0], [0.0, 0.0, 0.0])
+    state = facing(CAMERA, [0.45, 0.0, 0.0])
 
     @jax.jit
     def sees(config, state):
@@ -79,7 +64,7 @@ def searching(search):
 
 def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):
     approach = jax.jit(lambda state: act.approach(team, models, state, CAMERA)[0])
-    viewpoint = facing(CAMERA, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]).roadmap.viewpoints[0, 0]
+    viewpoint = facing(CAMERA).roadmap.viewpoints[0, 0]
     there, short = [*viewpoint, 0.0], [viewpoint[0] + 0.25, viewpoint[1], 0.0]
     for pose, error, phase in (
         (there, 0.0, FACING),
@@ -87,7 +72,7 @@ def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, fac
         (short, 0.0, DRIVING),
         (short, -0.25, FACING),
     ):
-        state = facing(CAMERA, pose, [error, 0.0, 0.0])
+        state = facing(CAMERA, pose, error=[error, 0.0, 0.0])
         state = set_robot(state, CAMERA, phase=DRIVING, view=0, path_left=0.5, progress_at=0.0)
         assert approach(state).robots.phase[CAMERA] == phase
 

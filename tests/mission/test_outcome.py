@@ -48,6 +48,8 @@ def test_figures_as_worked_by_hand(team, known, ended):
     found = measure(state)
     np.testing.assert_array_equal(found["is_right"], [True, True, False])
     np.testing.assert_array_equal(found["ambiguous"], [False, True, False])
+    np.testing.assert_allclose(found["nll"][:2], -np.log(found["confidence"][:2]), rtol=1e-6)
+    assert found["nll"][2] > 1 > found["nll"][1] > 0.5 > found["nll"][0] > 0
     # Colours: green, red and, wrongly, green; shapes: round, round and, wrongly, round.
     np.testing.assert_allclose(found["told"]["camera"], 2 / 3)
     np.testing.assert_allclose(found["told"]["lidar"], 2 / 3)

@@ -24,7 +24,7 @@ from scipy.sparse import csgraph
 from jaxsense import sim
 from jaxsense.config import Config
 from jaxsense.config.mission import NavigationConfig
-from jaxsense.config.scene import ArenaConfig
+from jaxsense.config.scene import ArenaConfig, ViewpointConfig
 from jaxsense.mission import roadmap
 
 WALLED_IN = Config(
@@ -43,16 +43,22 @@ def to_viewpoints(ways):
     return jax.vmap(of_views, (0, None))(pois, views)
 
 
-@pytest.mark.parametrize("poi", [0, 1])
-def test_viewpoints_lie_all_around_at_the_configured_distances(poi):
-    config = Config()
+# A look is from .6 to .64 m; viewpoints keep a quarter of the .04 m from either limit.
+NARROW = Config(
+    viewpoint=ViewpointConfig(min_distance=0.6), navigation=NavigationConfig(view_range=0.64)
+)
+
+
+@pytest.mark.parametrize(
+    ("poi", "config", "distances"), [(0, CONFIG, (0.5, 0.9)), (1, NARROW, (0.61, 0.63))]
+)
+def test_viewpoints_lie_all_around_at_the_configured_distances(poi, config, distances):
     position = np.array([[0.3, -0.2], [-0.9, 0.9], [1.0, 1.0]])
     ways = planned(config, position)
     assert ways.viewpoints.shape == (3, 2 * 16, 2)
     away = np.array(ways.viewpoints[poi]) - position[poi]
     distance = np.linalg.norm(away, axis=-1).reshape(2, 16)
-    expected = np.repeat([[0.5], [0.9]], 16, axis=1)
-    np.testing.assert_allclose(distance, expected, atol=1e-6)
+    np.testing.assert_allclose(distance.T, [distances] * 16, atol=1e-6)
     # Every 360 / 16 = 22.5 degrees, from 0 to 337.5.
     side = np.degrees(np.arctan2(away[:, 1], away[:, 0])).reshape(2, 16)
     turned = (side - 22.5 * np.arange(16) + 180) % 360 - 180

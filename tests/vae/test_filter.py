@@ -109,6 +109,20 @@ def test_looks_multiply_the_odds_of_classes():
     np.testing.assert_allclose(np.exp(after), [0.25, 0.5, 0.25], atol=1e-6)
 
 
+def test_histories_are_of_looks_at_their_classes_that_are_drawn_evenly():
+    # Of each class two looks by each sensor; their second feature tells which one.
+    of_class = np.stack([np.arange(3.0)] * 2, axis=1)
+    looks = jnp.array(np.stack([of_class, [[0, 1]] * 3], axis=-1))
+    problem = fusion.filtering(TRAINED, untrained_filter(), (looks, looks + 10))
+    classes, sensors, found = jax.jit(problem.draw, static_argnums=1)(jax.random.key(0), 4)
+    np.testing.assert_array_equal(np.unique(classes), range(3))
+    np.testing.assert_array_equal(np.unique(sensors), range(2))
+    for offset, of_sensor in zip((0, 10), found, strict=True):
+        shown, row = np.moveaxis(of_sensor - offset, 1, 0)
+        np.testing.assert_array_equal(shown, np.broadcast_to(classes[:, None], shown.shape))
+        assert np.mean(row) == pytest.approx(0.5, abs=0.03)  # four deviations, of 6,144
+
+
 TRAINED = FilterConfig(steps=600)
 
 

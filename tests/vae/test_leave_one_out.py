@@ -124,6 +124,7 @@ def test_alpha_sets_in_late():
     )  # fmt: skip
     problem = leave_one_out.problem(config, LOOKS, MODEL)
     rows, noise = problem.draw(KEY, 1)
+    np.testing.assert_array_equal(np.unique(rows), range(POIS))
     drawn, loss = (rows[0], noise[0]), jax.jit(problem.loss)
     early, start, late, end = (
         float(loss(PARAMS, drawn, jnp.int32(step))) for step in (0, 40, 60, 99)

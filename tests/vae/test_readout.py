@@ -54,6 +54,15 @@ def test_a_belief_that_is_only_near_the_prior_is_read_by_its_moments():
         np.testing.assert_allclose(read(near, prior), shares, atol=0.01)
 
 
+def test_a_belief_that_is_nearly_certain_is_read_by_its_moments():
+    # Between two classes that are close, too long a step would choose one for good.
+    line = Belief(jnp.array([[-2.0], [0.5], [0.7], [2.0]]), jnp.full((4, 1), 0.3))
+    held = mixture(line, jnp.array([0.01, 0.01, 0.97, 0.01]))
+    prior = Belief(jnp.zeros(1), jnp.full(1, 4.5))
+    found = mixture(line, jax.jit(readout.make(line).class_probabilities)(held, prior))
+    np.testing.assert_allclose([*found.mean, *found.std], [*held.mean, *held.std], rtol=1e-4)
+
+
 @functools.cache
 def held_and_read(prototypes):
     """Class probabilities as they are read from a belief that holds others, by classes' means."""
