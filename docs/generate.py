@@ -47,7 +47,7 @@ def _sections(name: str, section: Section) -> Iterator[tuple[str, Section]]:
 
 def _table_of_section(name: str, section: Section) -> str:
     rows = []
-    for field, kind, limits in fields_of(type(section)):
+    for field, kind, limits, _ in fields_of(type(section)):
         value = getattr(section, field)
         if not isinstance(value, Section):
             mark = " †" if field in section.LEAVES else ""

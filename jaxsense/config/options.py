@@ -10,7 +10,9 @@ import json
 import re
 import shlex
 import sys
+import tomllib
 import types
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import (
@@ -22,10 +24,9 @@ from typing import (
     cast,
     get_args,
     get_origin,
-    get_type_hints,
 )
 
-from jaxsense.config.section import ConfigError
+from jaxsense.config.section import ConfigError, fields_of
 from jaxsense.config.whole import Config
 
 T = TypeVar("T")
@@ -37,20 +38,23 @@ def as_plain(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-def from_plain(stored: object, base: Config | None = None) -> Config:
+def from_plain(stored: object, base: Config | None = None, *, skips: bool = False) -> Config:
     """Makes settings from plain data, the inverse of `as_plain`.
 
     Args:
       stored: sections and their fields.
       base: source of missing settings; the defaults by default.
+      skips: whether to skip what are constants now, as models do that travel with the package.
 
     Raises:
       ConfigError: names a field that is unknown, of the wrong type, or invalid.
     """
-    return cast(Config, _made(Config, stored, base or Config()))
+    return cast(Config, _made(Config, stored, base or Config(), skips=skips))
 
 
-def _made(kind: Any, stored: object, base: object = None, place: str = "") -> object:
+def _made(
+    kind: Any, stored: object, base: object = None, place: str = "", *, skips: bool = False
+) -> object:
     """A value of a type, its missing fields from `base`; dataclasses check their fields."""
     if not dataclasses.is_dataclass(kind):
         if isinstance(stored, dict) and len(inner := get_args(kind)) == 2:
@@ -58,15 +62,17 @@ def _made(kind: Any, stored: object, base: object = None, place: str = "") -> ob
         return stored
     if not isinstance(stored, dict):
         raise ConfigError(place or "config", stored, "must be an object with names and values")
-    kinds, given = get_type_hints(kind), {}
+    kinds, given = {name: each for name, each, *_ in fields_of(kind)}, {}
     for name, value in stored.items():
-        path = f"{place}.{name}".lstrip(".")
+        path, default = f"{place}.{name}".lstrip("."), getattr(base or kind, name, None)
+        is_nested = isinstance(default, Mapping) or dataclasses.is_dataclass(default)
+        if skips and (name not in kinds or isinstance(value, dict) != is_nested):
+            continue
         if name not in kinds:
             near = _nearest(path, [*flat(as_plain(Config()))])
             hint = f"; did you mean {' or '.join(near)}?" if near else ""
             raise ConfigError(path, value, f"unknown setting{hint}")
-        default = getattr(kind if base is None else base, name, None)
-        given[name] = _made(kinds[name], value, default, path)
+        given[name] = _made(kinds[name], value, default, path, skips=skips)
     if base is not None:
         return dataclasses.replace(cast(Any, base), **given)
     for field in dataclasses.fields(kind):
@@ -75,23 +81,12 @@ def _made(kind: Any, stored: object, base: object = None, place: str = "") -> ob
     return kind(**given)  # pyright: ignore[reportCallIssue]
 
 
-def without_former(stored: Mapping[str, Any], section: object | None = None) -> dict[str, Any]:
-    """Plain settings of models that travel with the package, without what are constants now."""
-    now, kept = vars(section or Config()), {}
-    for name, value in stored.items():
-        if dataclasses.is_dataclass(now.get(name)):
-            kept[name] = without_former(value, now[name])
-        elif name in now and isinstance(value, dict) == isinstance(now[name], dict):
-            kept[name] = value
-    return kept
-
-
 def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, object]:
     """Plain settings by `section.name`."""
     found: dict[str, object] = {}
     for name, value in settings.items():
-        inner = flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else None
-        found |= {f"{prefix}{name}": value} if inner is None else inner
+        path = f"{prefix}{name}"
+        found |= flat(value, f"{path}.") if isinstance(value, Mapping) else {path: value}
     return found
 
 
@@ -105,13 +100,15 @@ def _nearest(path: str, names: Sequence[str]) -> list[str]:
     return []
 
 
-def parse_json(content: bytes) -> object:
-    """Parses JSON strictly: UTF-8, no deep nesting, no field twice, no half of a character.
+def parse(content: bytes, *, is_toml: bool = False) -> object:
+    """Parses JSON or TOML strictly: UTF-8, no deep nesting, no field twice, no half of a character.
 
     Raises:
-      ValueError: if the content is not such JSON.
+      ValueError: if the content is something else.
     """
     try:
+        if is_toml:
+            return tomllib.loads(content.decode())
         found = json.loads(content.decode(), object_pairs_hook=_without_twins)
         json.dumps(found, ensure_ascii=False).encode()
         return found
@@ -120,9 +117,8 @@ def parse_json(content: bytes) -> object:
 
 
 def _without_twins(fields: list[tuple[str, object]]) -> dict[str, object]:
-    names = [name for name, _ in fields]
-    for name in names:
-        if names.count(name) > 1:
+    for name, number in Counter(name for name, _ in fields).items():
+        if number > 1:
             raise ValueError(f"{name!r} appears twice")
     return dict(fields)
 
@@ -213,12 +209,10 @@ def options_of(base: object, path: str = "", place: str | None = None) -> Iterat
     """
     section = base if isinstance(base, type) else type(base)
     place = getattr(section, "PLACE", "") if place is None else place
-    kinds, marked = get_type_hints(section), get_type_hints(section, include_extras=True)
-    for field in (each.name for each in dataclasses.fields(cast(Any, section))):
+    for field, kind, _, marks in fields_of(section):
         default = getattr(base, field, dataclasses.MISSING)
         to, inside = f"{path}.{field}".lstrip("."), f"{place}.{field}".lstrip(".")
-        is_positional = _POSITIONAL in get_args(marked[field])
-        name = field.upper() if is_positional else f"--{inside.replace('_', '-')}"
+        name = field.upper() if _POSITIONAL in marks else f"--{inside.replace('_', '-')}"
         if dataclasses.is_dataclass(default):
             yield from options_of(default, to)
         elif isinstance(default, Mapping):
@@ -227,9 +221,9 @@ def options_of(base: object, path: str = "", place: str | None = None) -> Iterat
                     yield from options_of(each, f"{to}.{key}", f"{inside}.{key}")
                 else:
                     entry = f"{name}.{key.replace('_', '-')}"
-                    yield Option(f"{to}.{key}", entry, get_args(kinds[field])[1], each, section)
+                    yield Option(f"{to}.{key}", entry, get_args(kind)[1], each, section)
         else:
-            yield Option(to, name, kinds[field], default, section)
+            yield Option(to, name, kind, default, section)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import inspect
+import math
 import pkgutil
 import types
 from collections.abc import Callable, Mapping
@@ -81,18 +82,18 @@ class FrozenDict(dict[K, V]):
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Limits of each number in a field, and of its number of items; None where there is none."""
+    """Limits of each number in a field, and of its number of items."""
 
-    above: float | None = None
-    at_least: float | None = None
-    below: float | None = None
-    at_most: float | None = None
+    above: float = -math.inf
+    at_least: float = -math.inf
+    below: float = math.inf
+    at_most: float = math.inf
     min_items: int = 0
-    max_items: int | None = None
+    max_items: float = math.inf
 
     def __str__(self) -> str:
         """Limits of a number, such as "from 0 to 1"; empty without any."""
-        if self.at_least is not None and self.at_most is not None:
+        if math.isfinite(self.at_least) and math.isfinite(self.at_most):
             return f"from {self.at_least:,} to {self.at_most:,}"
         words = {
             "greater than": self.above,
@@ -100,21 +101,13 @@ class Limits:
             "below": self.below,
             "at most": self.at_most,
         }
-        return " and ".join(f"{each} {x:,}" for each, x in words.items() if x is not None)
+        return " and ".join(f"{each} {x:,}" for each, x in words.items() if math.isfinite(x))
 
     def allow(self, number: float, *, is_whole: bool) -> bool:
         """Whether a number is within the limits, and fits 32 bits."""
-        is_large = self.at_most is not None and self.at_most >= 2**31
-        return (
-            (is_large or _fits(number, is_whole=is_whole))
-            and (self.above is None or number > self.above)
-            and (self.at_least is None or number >= self.at_least)
-            and (self.below is None or number < self.below)
-            and (self.at_most is None or number <= self.at_most)
-        )
-
-
-_NO_LIMITS = Limits()
+        is_large = 2**31 <= self.at_most < math.inf
+        is_inside = self.above < number < self.below and self.at_least <= number <= self.at_most
+        return is_inside and (is_large or _fits(number, is_whole=is_whole))
 
 
 def _fits(number: float, *, is_whole: bool) -> bool:
@@ -155,10 +148,10 @@ def check_fields(section: object) -> None:
     Raises:
       ConfigError: names the first invalid field.
     """
-    for name, kind, limits in fields_of(type(section)):
+    for name, kind, limits, marks in fields_of(type(section)):
         value = getattr(section, name)
         try:
-            object.__setattr__(section, name, _converted(value, kind, limits))
+            object.__setattr__(section, name, _converted(value, kind, limits, _LEAF in marks))
         except TypeError:
             expected = f"must be {described(kind, limits)}"
             numbers = [x for x in jax.tree.leaves(value) if isinstance(x, int | float)]
@@ -170,26 +163,24 @@ def check_fields(section: object) -> None:
 
 
 @functools.cache
-def fields_of(cls: type) -> list[tuple[str, object, Limits]]:
-    """Name, type and limits of each field of a dataclass."""
-    hints = get_type_hints(cls, include_extras=True)
-    fields = dataclasses.fields(cls)
-    return [(f.name, hints[f.name], f.metadata.get("limits", _NO_LIMITS)) for f in fields]
+def fields_of(cls: type) -> list[tuple[str, Any, Limits, tuple[str, ...]]]:
+    """Name, type, limits and marks, such as that of `Traced`, of each field of a dataclass."""
+    kinds, marked = get_type_hints(cls), get_type_hints(cls, include_extras=True)
+    limits = {f.name: f.metadata.get("limits", Limits()) for f in dataclasses.fields(cls)}
+    marks = {name: getattr(marked[name], "__metadata__", ()) for name in limits}
+    return [(name, kinds[name], limits[name], marks[name]) for name in limits]
 
 
 def _converted(value: object, kind: object, limits: Limits, is_leaf: bool = False) -> object:
     """A value in its declared form; raises `TypeError` if it is of another type or not allowed."""
     origin, inner = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return _converted(value, inner[0], limits, _LEAF in inner)
     if origin in (Union, types.UnionType):
         for each in inner:
             with contextlib.suppress(TypeError):
                 return _converted(value, each, limits, is_leaf)
     elif origin is tuple and isinstance(value, tuple | list):
         kinds = inner[:1] * len(value) if ... in inner else inner
-        most = len(value) if limits.max_items is None else limits.max_items
-        if len(kinds) == len(value) and limits.min_items <= len(value) <= most:
+        if len(kinds) == len(value) and limits.min_items <= len(value) <= limits.max_items:
             each = zip(value, kinds, strict=True)
             return tuple(_converted(x, of, limits, is_leaf) for x, of in each)
     elif origin is Mapping and isinstance(value, Mapping):
@@ -228,11 +219,9 @@ _WORDS: dict[object, str] = {
 }
 
 
-def described(kind: object, limits: Limits = _NO_LIMITS) -> str:
+def described(kind: object, limits: Limits) -> str:
     """Description of a declared type and its limits, after "must be"."""
     origin, inner = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        return described(inner[0], limits)
     if origin is Literal:
         return f"one of {', '.join(map(str, inner))}"
     if origin in (Union, types.UnionType):
@@ -240,7 +229,7 @@ def described(kind: object, limits: Limits = _NO_LIMITS) -> str:
     if origin is tuple:
         number = "" if ... in inner else f"{len(inner)} "
         if limits.min_items:
-            most = "or more" if limits.max_items is None else f"to {limits.max_items}"
+            most = "or more" if limits.max_items == math.inf else f"to {limits.max_items}"
             number = f"{limits.min_items} {most} "
         return f"a list of {number}values, each {described(inner[0], limits)}"
     if origin is Mapping:
@@ -282,9 +271,12 @@ class Section(Checked):
 
     def __init_subclass__(cls, place: str = "") -> None:
         super().__init_subclass__(place)
-        fields = {name: kind for name, kind, _ in fields_of(cls)}
-        cls.LEAVES = tuple(name for name, kind in fields.items() if _is_leaf(kind))
-        register(cls, cls.LEAVES, [name for name in fields if name not in cls.LEAVES])
+        is_leaf = {
+            name: _LEAF in marks or (isinstance(kind, type) and issubclass(kind, Section))
+            for name, kind, _, marks in fields_of(cls)
+        }
+        cls.LEAVES = tuple(name for name in is_leaf if is_leaf[name])
+        register(cls, cls.LEAVES, [name for name in is_leaf if not is_leaf[name]])
 
     def __post_init__(self):
         check_fields(self)
@@ -315,12 +307,6 @@ def _number(leaf: Any) -> Any:
 def _is_unknown(value: object) -> bool:
     """Whether a leaf is traced, or holds several numbers."""
     return isinstance(value, Tracer | jax.ShapeDtypeStruct) or np.size(value) != 1  # pyright: ignore[reportArgumentType]
-
-
-def _is_leaf(kind: object) -> bool:
-    """Whether a field holds leaves: it is declared `Traced` or is a section."""
-    is_section = isinstance(kind, type) and issubclass(kind, Section)
-    return is_section or _LEAF in getattr(kind, "__metadata__", ())
 
 
 def require_function(field: str, value: object, number: int, expected: str) -> None:

@@ -3,13 +3,12 @@
 import hashlib
 import json
 import os
-import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
-from jaxsense.config.options import parse_json
+from jaxsense.config.options import parse
 from jaxsense.config.section import Checked, limited, require
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
@@ -112,11 +111,11 @@ def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
 
 def _read(file: Path, field: str, path: Path) -> Json:
     """The content of a `config.json`; raises `ConfigError` about `field = path`."""
-    form, parse = ("TOML", _parse_toml) if file.suffix == ".toml" else ("JSON", parse_json)
+    form = "TOML" if file.suffix == ".toml" else "JSON"
     try:
         # A file that the user names may be a link, that of a run may not lead out of it.
         real = Path(os.path.realpath(file)) if path == file else file
-        if isinstance(content := parse(inside.read(real)), dict):
+        if isinstance(content := parse(inside.read(real), is_toml=form == "TOML"), dict):
             return content
         reason = f"{file.name} must hold an object"
     except OSError as error:
@@ -128,18 +127,11 @@ def _read(file: Path, field: str, path: Path) -> Json:
     raise ConfigError(field, str(path), reason)
 
 
-def _parse_toml(content: bytes) -> Json:
-    """Parses TOML; raises `ValueError` if the content is something else."""
-    try:
-        return tomllib.loads(content.decode())
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-
-
 def _settings_of(content: Json, trust: bool) -> Settings:
     """The settings in a `config.json`; raises `ConfigError` if one is unknown or wrong."""
     if unknown := sorted(set(content) - _KNOWN):
-        raise ConfigError(unknown[0], content[unknown[0]], "unknown field of a run's config.json")
+        reason = "unknown field of a run's config.json, which holds settings in config"
+        raise ConfigError(unknown[0], content[unknown[0]], reason)
     preset = content.get("preset", "default")
     if not isinstance(preset, str) or preset not in PRESETS:
         raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")

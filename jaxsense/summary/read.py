@@ -9,7 +9,7 @@ from typing import Annotated, NotRequired, Union, cast, get_args, get_origin, ge
 from typing import is_typeddict as is_block
 
 from jaxsense.config import ConfigError
-from jaxsense.config.options import command, parse_json
+from jaxsense.config.options import command, parse
 from jaxsense.core import inside
 from jaxsense.summary.blocks import Evaluation, Interval, Missions, Origin, Results, Summary, Timed
 
@@ -55,7 +55,7 @@ def read_origins(run: Path) -> list[Origin]:
 
 def _read(run: Path, file: Path, kind: type) -> object:
     try:
-        content = parse_json(inside.read(file))
+        content = parse(inside.read(file))
         json.dumps(content, allow_nan=False)
         wrong = _wrong(content, kind, file.stem)
         # With several seeds, only the results of each seed have this type.

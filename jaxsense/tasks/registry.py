@@ -12,7 +12,6 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, from_plain
-from jaxsense.config.options import without_former
 from jaxsense.config.section import require_32_bits
 from jaxsense.core.types import Key, placed
 from jaxsense.dqn.team import Travel
@@ -183,7 +182,7 @@ def read(file: Path) -> tuple[Arrays, Config, Origin]:
     with np.load(file, allow_pickle=False) as found:
         arrays = {name: found[name] for name in found.files}
     about = json.loads(str(arrays.pop("about")))
-    return arrays, from_plain(without_former(about["config"])), Origin(**about["origin"])
+    return arrays, from_plain(about["config"], skips=True), Origin(**about["origin"])
 
 
 def _read(field: str, name: str, known: Iterable[str]) -> tuple[Arrays, Config, Origin]:
