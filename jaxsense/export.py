@@ -32,13 +32,12 @@ from jaxsense.interfaces.common import extra
 from jaxsense.mission import maps
 from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
-from jaxsense.models import Models, make_agent, make_jmvae, make_travel
+from jaxsense.models import Models, make_agent, make_travel
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.version import __version__
 from jaxsense.sim import sensors
 from jaxsense.sim.sensors import Sensor
 from jaxsense.tasks.registry import PREFIX
-from jaxsense.vae.jmvae import Jmvae
 
 PROGRAM = "jaxsense.export"
 
@@ -92,14 +91,11 @@ _MEANING = {
 
 def functions(config: Config) -> dict[str, Function]:
     """All functions that a robot needs, by name, see `docs/interfaces.md`."""
-    model, own_maps = make_jmvae(config), config.mission.communication.own_maps
     found = {"classify": _classify(config), "decide": _decide(config)}
-    for m, name in enumerate(model.modalities):
-        found |= {f"detect_{name}": _detect(config, m), f"weigh_{name}": _weigh(m)}
-        found |= (
-            {f"tell_{name}": _tell(model, m)} if own_maps else {f"write_{name}": _write(model, m)}
-        )
-    if own_maps:
+    for m, sensor in enumerate(sensors.make(config)):
+        of_sensor = _functions_of(config, m, sensor)
+        found |= {f"{kind}_{sensor.name}": function for kind, function in of_sensor.items()}
+    if config.mission.communication.own_maps:
         found["merge"] = _merge, {"sums": _real(_ROBOTS, _POIS, len(config.arena.classes))}
     return found
 
@@ -108,56 +104,44 @@ def _real(*shape: Any) -> Struct:
     return Struct(shape, jnp.float32)
 
 
-def _detect(config: Config, m: int) -> Function:
-    sensor, mission = sensors.make(config)[m], config.mission
+def _functions_of(config: Config, m: int, sensor: Sensor) -> dict[str, Function]:
+    """What a robot does with looks by a sensor."""
 
     def detect(
         models: Models, readings: jax.Array, bearing: jax.Array, distance: jax.Array
     ) -> Arrays:
         """What a look says."""
-        search = Search(*mission.localisation.search)
+        search = Search(*config.mission.localisation.search)
         found = models.detect(m, sensor, readings, bearing, distance, search)
-        is_confident = jnp.max(found.features) >= mission.least_confidence
+        is_confident = jnp.max(found.features) >= config.mission.least_confidence
         return {**vars(found), "detects": found.is_there & is_confident}
 
-    return detect, {"readings": _real(*sensor.shape), "bearing": _real(), "distance": _real()}
-
-
-def _weigh(m: int) -> Function:
     def weigh(models: Models, apart: jax.Array) -> Arrays:
         """How much of a look is new after earlier ones."""
         novelty = models.novelty
         return {"weight": novelty.weight(apart, m), "to_go": novelty.to_go(apart, m)}
 
-    return weigh, {"apart": _real(_LOOKS)}
-
-
-def _tell(model: Jmvae, m: int) -> Function:
     def tell(models: Models, features: jax.Array, weight: jax.Array) -> Arrays:
         """The evidence of a look, for the sum of a robot's own looks."""
         return {"evidence": maps.log_likelihood(models, features, m, weight)}
 
-    return tell, {"features": _real(model.feature_sizes[m]), "weight": _real()}
-
-
-def _write(model: Jmvae, m: int) -> Function:
     def write(
-        models: Models,
-        mean: jax.Array,
-        std: jax.Array,
-        seen: jax.Array,
-        features: jax.Array,
-        weight: jax.Array,
+        models: Models, mean: jax.Array, std: jax.Array, seen: jax.Array, *look: jax.Array
     ) -> Arrays:
         """The belief about a PoI after a look."""
+        features, weight = look
         after = models.fusion.update(Belief(mean, std), seen, features, m, weight)
         return {"new_mean": after.mean, "new_std": after.std}
 
-    return write, {
-        "mean": _real(model.latent_size),
-        "std": _real(model.latent_size),
-        "seen": Struct((len(model.modalities),), bool),
-        **_tell(model, m)[1],
+    own_maps = config.mission.communication.own_maps
+    belief = dict.fromkeys(("mean", "std"), _real(config.jmvae.latent_size))
+    seen = {"seen": Struct((len(config.modalities),), bool)}
+    look = {"features": _real(len(config.labels(sensor.name))), "weight": _real()}
+    scan = {"readings": _real(*sensor.shape), "bearing": _real(), "distance": _real()}
+    return {
+        "detect": (detect, scan),
+        "weigh": (weigh, {"apart": _real(_LOOKS)}),
+        **({"tell": (tell, look)} if own_maps else {"write": (write, belief | seen | look)}),
     }
 
 
@@ -178,8 +162,7 @@ def _classify(config: Config) -> Function:
             "plausible": jax.vmap(models.plausible_classes)(read),
         }
 
-    of_pois = _real(_POIS, config.jmvae.latent_size)
-    return classify, {"mean": of_pois, "std": of_pois}
+    return classify, dict.fromkeys(("mean", "std"), _real(_POIS, config.jmvae.latent_size))
 
 
 def _decide(config: Config) -> Function:

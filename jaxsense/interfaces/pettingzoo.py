@@ -110,9 +110,6 @@ class TeamAECEnv(AECEnv):
     def render(self) -> None:
         """Draws nothing: there is no `render_mode`."""
 
-    def close(self) -> None:
-        """Closes nothing."""
-
     def _tell(self, seconds: float, mask: jax.Array) -> None:
         """Sets the infos, and whose turn it is."""
         self.infos = {

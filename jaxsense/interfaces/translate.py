@@ -368,8 +368,7 @@ def program(
       NotImplementedError: if a primitive of the function has no translation.
     """
     # Parameters that a user has made with NumPy may have 64 bits.
-    models = jax.tree.map(lambda x: np.asarray(jnp.asarray(x)), models)
-    weights = by_place(models)
+    weights = {place: np.asarray(jnp.asarray(x)) for place, x in by_place(models).items()}
     closed, outputs = jax.make_jaxpr(apply, return_shape=True)(models, *inputs.values())
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(outputs))
     # Weights begin as inputs, which have names.
