@@ -17,7 +17,7 @@ from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn import rewards, starts
+from jaxsense.dqn import starts
 from jaxsense.looks import Bank, Live
 from jaxsense.sim import world as worlds
 from jaxsense.vae import jmvae
@@ -103,13 +103,6 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     # Nothing else of them is an input of a compiled program.
     assert jax.tree.leaves(places) == [*config.team.sides, PLANNING_RADIUS]
     assert mdp.teams.config is config.team
-
-
-def test_entropy_by_hand():
-    # (ln 2) / 2 + 2 (ln 4) / 4; a class without weight counts nothing.
-    weights = jnp.array([[0.5, 0.25, 0.25], [0.0, 0.5, 0.5], [0.0, 1.0, 0.0]])
-    expected = [1.5 * np.log(2), np.log(2), 0.0]
-    np.testing.assert_allclose(rewards.entropy(weights), expected, atol=1e-6)
 
 
 def test_the_reward_in_nats_is_the_fall_of_the_maps_entropy_minus_the_cost(models):

@@ -182,19 +182,6 @@ def test_first_choices_go_round_the_robots_that_work():
     assert states[2].seen[0, LIDAR]
 
 
-def test_an_episode_is_cut_after_its_own_number_of_choices():
-    mdp = make_mdp(classes_mdp(partly_seen_starts=False, max_steps=1), max_steps=3)
-    state, cut = start([[0, 0, 0]], [CAMERA], mdp), []
-    step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
-    for _ in range(3):
-        state, outcome = step(jax.random.key(0), state, jnp.int32(0))
-        cut.append(bool(outcome.truncated))
-    assert cut == [False, False, True]
-    _, ended = step(jax.random.key(0), state, jnp.int32(NOP))
-    assert ended.terminated
-    assert not ended.truncated
-
-
 @jax.jit
 def alone_and_on_the_map(key, mdp, team, mapped, known, action):
     return mdps.step(key, mdp, team, action), mdps.step(key, mapped, known, action)

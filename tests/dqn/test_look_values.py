@@ -242,4 +242,7 @@ def test_the_entropy_has_a_finite_gradient_everywhere():
     found = jax.grad(rewards.entropy)(jnp.array([0.5, 0.5, 0.0]))
     # -(log p + 1), and 0 for a probability of 0.
     np.testing.assert_allclose(found, [np.log(2) - 1, np.log(2) - 1, 0], rtol=1e-6)
-    assert float(rewards.entropy(jnp.array([0.5, 0.5, 0.0]))) == pytest.approx(np.log(2))
+    # (ln 2) / 2 + 2 (ln 4) / 4; a class without weight counts nothing.
+    weights = jnp.array([[0.5, 0.25, 0.25], [0.0, 0.5, 0.5], [0.0, 1.0, 0.0]])
+    expected = [1.5 * np.log(2), np.log(2), 0.0]
+    np.testing.assert_allclose(rewards.entropy(weights), expected, atol=1e-6)

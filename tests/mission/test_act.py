@@ -143,6 +143,15 @@ def test_only_a_robot_that_faces_the_poi_and_is_calm_scans(
     assert after.robots.looks[CAMERA] == scans
 
 
+def test_a_robot_turns_to_either_side_of_its_target(team, models, facing):
+    bearing = lambda key, state: act._aim(team, models, CAMERA, key, state).bearing  # noqa: E731
+    keys = jax.random.split(jax.random.key(0), 100)
+    shares = jax.jit(jax.vmap(bearing, (0, None)))(keys, facing(CAMERA)) / np.radians(
+        CONFIG.viewpoint.bearing_error
+    )
+    assert -1 <= shares.min() < -0.9 < 0.9 < shares.max() <= 1
+
+
 def test_after_some_failures_the_poi_is_given_up(scan, facing, set_robot):
     state = facing(CAMERA, other=IN_THE_VIEW)
     for attempt in range(1, ATTEMPTS + 1):

@@ -23,19 +23,13 @@ def last_first(key, models, known):
     return jnp.append(jnp.where(known.is_seen, -1.0, jnp.arange(1.0, number + 1)), 0.0)
 
 
-def close(key, models, known):
-    """Values close to each other, of which that of a farther PoI is the highest."""
-    del key, models, known
-    return jnp.array([1.0, 0.95, 0.0, 0.0])
-
-
 def lost(key, models, known):
     """A value that is NaN, of the last PoI."""
     del key, models, known
     return jnp.array([1.0, 0.5, jnp.nan, 0.0])
 
 
-OWN = {"mine": last_first, "close": close, "lost": lost}
+OWN = {"mine": last_first, "lost": lost}
 
 
 @pytest.fixture(scope="module")
@@ -59,16 +53,11 @@ def test_a_policy_of_ones_own_chooses_pois(own, decides, arena_of):
     assert decides(state).robots.target[0] == 3  # NOP
 
 
-def test_the_highest_value_is_taken_however_close_the_next(own, decides, arena_of):
-    state = replace(arena_of(POSITIONS, POSES), policy=jnp.int32(own.policy("close")))
-    assert decides(state).robots.target[0] == 0
-
-
 def test_a_robot_whose_policy_has_no_value_fails(own, decides, arena_of):
     state = arena_of(POSITIONS, POSES)
     state = replace(state, policy=jnp.int32(own.policy("lost")))
     after = decides(state).robots
-    assert (after.target[0], after.phase[0]) == (-1, FAILED)
+    assert (after.target[0], after.phase[0], after.goals[0]) == (-1, FAILED, 0)
     # Not of a PoI that it has given up.
     given_up = state.robots.undetected.at[0, 2].set(True)
     state = replace(state, robots=replace(state.robots, undetected=given_up))
@@ -91,7 +80,7 @@ def playing(*names):
 )
 def test_the_name_of_a_policy_is_a_word_that_is_free(name, reason):
     with pytest.raises(ConfigError, match=rf"^policies = {name!r}: {reason}"):
-        require_playable(CONFIG, {name: close})
+        require_playable(CONFIG, {name: lost})
 
 
 RUN = ["--preset", "smoke", "--quiet", "--mission.policies", "latent", "mine"]
