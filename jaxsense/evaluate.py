@@ -10,7 +10,7 @@ from jaxsense import mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Positional
-from jaxsense.config.section import Checked, limited
+from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.run import cli, devices, files, missions, output, rundir
 from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
@@ -194,8 +194,7 @@ def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission
     cases = mission.cases(scenario.config, scenario.policies)
     known = {"all": cases, "policies": {name: cases[name] for name in scenario.policies}}
     known |= {name: {name: case} for name, case in cases.items()}
-    if arguments.policy not in known:
-        raise ConfigError("policy", arguments.policy, f"must be one of {', '.join(known)}")
+    require_known("policy", arguments.policy, known)
     return known[arguments.policy]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import command, given
-from jaxsense.config.section import Checked, limited
+from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, output, pipeline, rundir
 from jaxsense.run.compilation import Compiler
@@ -162,8 +162,7 @@ def _stored(argv: list[str], change: Callable[[Config], Config]) -> Settings:
     if isinstance(file := values.get("config"), Path):
         return read_settings(file, is_trusted)
     preset = str(values.get("settings.preset", "default"))
-    if preset not in PRESETS:
-        raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
+    require_known("preset", preset, PRESETS)
     return Settings(preset, 0, change(PRESETS[preset]))
 
 

@@ -11,7 +11,7 @@ import inspect
 import math
 import pkgutil
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import (
     Annotated,
@@ -132,6 +132,12 @@ def require(condition: object, section: object, field: str, expected: str) -> No
     """Raises a `ConfigError` about a field of a dataclass unless a condition holds."""
     if not condition:
         raise ConfigError(_place(section, field), getattr(section, field), expected)
+
+
+def require_known(field: str, value: object, known: Iterable[str]) -> None:
+    """Raises a `ConfigError` unless a value is one of the known names."""
+    if value not in (names := [*known]):
+        raise ConfigError(field, value, f"must be one of {', '.join(names)}")
 
 
 def _place(section: object, field: str) -> str:

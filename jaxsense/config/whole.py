@@ -25,7 +25,14 @@ from jaxsense.config.scene import (
     ViewpointConfig,
     require_words,
 )
-from jaxsense.config.section import ConfigError, FrozenDict, Section, limited, require
+from jaxsense.config.section import (
+    ConfigError,
+    FrozenDict,
+    Section,
+    limited,
+    require,
+    require_known,
+)
 
 _MAX_MODALITIES = 8  # the JMVAE has an encoder for each subset
 _MAX_ROBOTS = 64
@@ -88,9 +95,7 @@ class Config(Section):
         for name, sensor in self.sensors.items():
             if name in (*MODALITIES, "joint"):
                 raise ConfigError("sensors", name, "already exists")
-            if sensor.attribute not in attributes:
-                expected = f"must be one of {', '.join(attributes)}"
-                raise ConfigError(f"sensors.{name}.attribute", sensor.attribute, expected)
+            require_known(f"sensors.{name}.attribute", sensor.attribute, attributes)
         for name in self.arena.attributes:
             if name not in (sensor.attribute for sensor in self.sensors.values()):
                 reason = "no sensor reads it; add one to sensors"
@@ -219,9 +224,7 @@ class Config(Section):
 
     def attribute(self, modality: str) -> str:
         """Attribute that a modality reads: `colour`, `shape` or one of `arena.attributes`."""
-        known = [*MODALITIES, *self.sensors]
-        if modality not in known:
-            raise ConfigError("modality", modality, f"must be one of {', '.join(known)}")
+        require_known("modality", modality, [*MODALITIES, *self.sensors])
         own = self.sensors.get(modality)
         return MODALITIES[modality] if own is None else own.attribute
 

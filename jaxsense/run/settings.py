@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from jaxsense.config import PRESETS, Config, ConfigError, as_plain, from_plain
 from jaxsense.config.options import parse
-from jaxsense.config.section import Checked, limited, require
+from jaxsense.config.section import Checked, limited, require, require_known
 from jaxsense.core import inside
 from jaxsense.run.version import __version__, commit, versions
 
@@ -132,10 +132,8 @@ def _settings_of(content: Json, trust: bool) -> Settings:
     if unknown := sorted(set(content) - _KNOWN):
         reason = "unknown field of a run's config.json, which holds settings in config"
         raise ConfigError(unknown[0], content[unknown[0]], reason)
-    preset = content.get("preset", "default")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise ConfigError("preset", preset, f"must be one of {', '.join(PRESETS)}")
-    config = from_plain(content.get("config", {}), PRESETS[preset])
+    require_known("preset", preset := content.get("preset", "default"), PRESETS)
+    config = from_plain(content.get("config", {}), PRESETS[str(preset)])
     if not trust:
         config.require_trust()
     numbers = {name: content[name] for name in ("seed", "num_seeds") if name in content}

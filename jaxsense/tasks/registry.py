@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from jaxsense import models
 from jaxsense.config import Config, ConfigError, from_plain
-from jaxsense.config.section import require_32_bits
+from jaxsense.config.section import require_32_bits, require_known
 from jaxsense.core.types import Key, placed
 from jaxsense.dqn.team import Travel
 from jaxsense.looks import Bank, make_mdp
@@ -101,7 +101,7 @@ def make(name: str, agent: str | None = None) -> Task:
     arrays, config, _ = _read("name", name, TASKS)
     acting = agents_of(config)
     agent = acting[0] if agent is None else agent
-    _require_known("agent", agent, acting)
+    require_known("agent", agent, acting)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
     parts = models_of(config, **_trained(arrays, config, "fusion", "look_values"))
@@ -187,13 +187,8 @@ def read(file: Path) -> tuple[Arrays, Config, Origin]:
 
 def _read(field: str, name: str, known: Iterable[str]) -> tuple[Arrays, Config, Origin]:
     """The file of one of the known names; raises `ConfigError` for others."""
-    _require_known(field, name, known)
+    require_known(field, name, known)
     return read(DATA / f"{name}.npz")
-
-
-def _require_known(field: str, value: str, known: Iterable[str]) -> None:
-    if value not in tuple(known):  # a list has no hash
-        raise ConfigError(field, value, f"must be one of {', '.join(known)}")
 
 
 def _trained(arrays: Arrays, config: Config, *parts: str) -> dict[str, PyTree]:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxsense.config import Config
+from jaxsense.config.section import require_known
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.models import Models, make_models
@@ -137,9 +138,8 @@ def learn(key: Key, config: Config, *, until: str | None = None) -> Learned:
       config: all settings. Fields declared `Traced` may be traced, so that `jax.vmap` varies them.
       until: name of the last stage; all stages by default.
     """
-    names = [stage.name for stage in stages(config)]
-    if until is not None and until not in names:
-        raise ValueError(f"until = {until!r}: must be one of {', '.join(names)}")
+    if until is not None:
+        require_known("until", until, [stage.name for stage in stages(config)])
     outputs, progress, finite = dict[str, Output](), dict[str, Progress](), [jnp.bool_(True)]
 
     def drive(stage: Stage, **inputs: Output) -> Output:
