@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsense import tasks
@@ -65,14 +66,10 @@ class TeamAECEnv(AECEnv):
         if seed is not None or self._key is None:
             (word,) = np.random.SeedSequence(seed).generate_state(1)
             self._key = jax.random.key(int(word))
-        self._key, self._state, observations, mask = _start(self._key, self._robots)
-        self.agents = list(self.possible_agents)
-        self._observations = self._named(observations)
-        self._tell(0.0, mask)
-        self.rewards = dict.fromkeys(self.agents, 0.0)
+        self._key, self._state, *told = _start(self._key, self._robots)
+        self.agents, self._observations = list(self.possible_agents), {}
+        self._tell(*told)
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
-        self.terminations = dict.fromkeys(self.agents, False)
-        self.truncations = dict.fromkeys(self.agents, False)
         self._skip_agent_selection = None
 
     def observe(self, agent: str) -> np.ndarray:
@@ -95,14 +92,8 @@ class TeamAECEnv(AECEnv):
         if not self.action_space(agent).contains(np.asarray(action)):
             raise ValueError(f"action = {action!r}: must be in {self.action_space(agent)}")
         chosen = np.full(len(self.possible_agents), int(action), np.int32)
-        self._key, self._state, found, seconds, mask = _step(
-            self._key, self._robots, self._state, chosen
-        )
-        self._observations |= self._named(found.observation)  # of robots that left, the last stays
-        self.rewards = self._named(found.reward, float)
-        self.terminations = self._named(found.terminated, bool)
-        self.truncations = self._named(found.truncated, bool)
-        self._tell(float(seconds), mask)
+        self._key, self._state, *told = _step(self._key, self._robots, self._state, chosen)
+        self._tell(*told)
         self._cumulative_rewards[agent] = 0.0
         self._accumulate_rewards()
         self._deads_step_first()
@@ -110,10 +101,14 @@ class TeamAECEnv(AECEnv):
     def render(self) -> None:
         """Draws nothing: there is no `render_mode`."""
 
-    def _tell(self, seconds: float, mask: jax.Array) -> None:
-        """Sets the infos, and whose turn it is."""
+    def _tell(self, found: TimeStep, seconds: jax.Array, mask: jax.Array) -> None:
+        """Sets what each robot is told, and whose turn it is."""
+        self._observations |= self._named(found.observation)  # of robots that left, the last stays
+        self.rewards = self._named(found.reward, float)
+        self.terminations = self._named(found.terminated, bool)
+        self.truncations = self._named(found.truncated, bool)
         self.infos = {
-            agent: {"seconds": seconds, "action_mask": of_robot}
+            agent: {"seconds": float(seconds), "action_mask": of_robot}
             for agent, of_robot in self._named(mask, np.int8).items()
         }
         self.agent_selection = self.possible_agents[int(self._state.agent)]
@@ -131,19 +126,21 @@ def make(name: str) -> TeamAECEnv:
     return TeamAECEnv(tasks.make(name))
 
 
+Told = tuple[Key, State, TimeStep, jax.Array, jax.Array]
+"""Next key, state, time steps of the robots, seconds, and `[R, N + 1]` actions that robots have."""
+
+
 @jax.jit
-def _start(key: Key, robots: Robots) -> tuple[Key, State, jax.Array, jax.Array]:
-    """Next key, state, `[R, S]` observations and `[R, N + 1]` actions that robots have."""
+def _start(key: Key, robots: Robots) -> Told:
     next_key, key = jax.random.split(key)
     _, state = robots.played.reset(key)
-    return next_key, state, robots.observe(state), robots.action_mask(state)
+    nothing, nobody = jnp.zeros(len(robots.names)), jnp.zeros(len(robots.names), bool)
+    found = TimeStep(robots.observe(state), nothing, nobody, nobody)
+    return next_key, state, found, jnp.float32(0), robots.action_mask(state)
 
 
 @jax.jit
-def _step(
-    key: Key, robots: Robots, state: State, actions: jax.Array
-) -> tuple[Key, State, TimeStep, jax.Array, jax.Array]:
-    """Next key, state, time steps of the robots, seconds, and actions that robots have."""
+def _step(key: Key, robots: Robots, state: State, actions: jax.Array) -> Told:
     next_key, key = jax.random.split(key)
     after, found, seconds = robots.step(key, state, actions)
     return next_key, after, found, seconds, robots.action_mask(after)

@@ -178,17 +178,15 @@ def _stack(graph: Graph, e: Equation, *parts: Var) -> Var:
 
 def _slice(graph: Graph, e: Equation, x: Var) -> Var:
     starts, ends = (graph.shape(e.params[f"{end}_indices"]) for end in ("start", "limit"))
-    axes = list(range(len(e.params["start_indices"])))
-    steps = list(e.params["strides"] or [1] * len(axes))
-    return op.slice(x, starts, ends, graph.constant(axes), graph.constant(steps))
+    strides = e.params["strides"]
+    return op.slice(x, starts, ends, steps=strides and graph.constant([*strides]))
 
 
 def _dynamic_slice(graph: Graph, e: Equation, x: Var, *starts: Var) -> Var:
     sizes = e.params["slice_sizes"]
     of_axes = zip(starts, e.invars[0].aval.shape, sizes, strict=True)
     first = graph.vector([graph.start(*each) for each in of_axes])
-    axes = graph.constant(list(range(len(starts))))
-    return op.slice(x, first, op.add(first, graph.shape(sizes)), axes)
+    return op.slice(x, first, op.add(first, graph.shape(sizes)))
 
 
 def _reduced(operator: Callable[..., Var], dtype: Any = None) -> Callable[..., Var]:
@@ -234,8 +232,7 @@ def _gather(graph: Graph, e: Equation, x: Var, indices: Var) -> Var:
         # The index on this axis is a sum of terms, each along some axes of the result.
         index = op.expand(graph.constant(0), graph.shape(found))
         if axis in of_starts:
-            at = graph.constant(of_starts[axis])
-            start = op.gather(indices, at, axis=e.invars[1].aval.ndim - 1)
+            start = op.gather(indices, graph.constant(of_starts[axis]), axis=-1)
             term = graph.broadcast(graph.start(start, length, size), found, batch)
             index = op.add(index, term)
         if axis in of_batch or axis not in numbers.collapsed_slice_dims:
