@@ -101,6 +101,9 @@ class TeamAECEnv(AECEnv):
     def render(self) -> None:
         """Draws nothing: there is no `render_mode`."""
 
+    def close(self) -> None:
+        """Closes nothing, as PettingZoo's own test asks of what has `render`."""
+
     def _tell(self, found: TimeStep, seconds: jax.Array, mask: jax.Array) -> None:
         """Sets what each robot is told, and whose turn it is."""
         self._observations |= self._named(found.observation)  # of robots that left, the last stays
