@@ -96,8 +96,7 @@ class Graph:
 
     def start(self, index: Var, size: Size, window: Size = 1) -> Var:
         """The index where a window starts, moved into its axis as XLA does."""
-        last = op.min([op.cast(index, to=np.int64), self.size(size - window)])
-        return op.max([last, self.constant(0)])
+        return op.clip(op.cast(index, to=np.int64), self.constant(0), self.size(size - window))
 
     def run(self, closed: core.ClosedJaxpr, inputs: Sequence[Var]) -> list[Var]:
         """Translates all equations of a function, and returns its outputs."""
@@ -139,9 +138,8 @@ def _inlined(graph: Graph, e: Equation, *given: Var) -> list[Var]:
 
 
 def _round(graph: Graph, e: Equation, x: Var) -> Var:
-    require(
-        e.params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN, "rounding away from zero"
-    )
+    is_even = e.params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN
+    require(is_even, "rounding away from zero")
     return op.round(x)
 
 
