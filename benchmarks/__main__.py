@@ -1,7 +1,6 @@
 """`python -m benchmarks`: one table of how fast each stage is, and how fast its peer."""
 
 import contextlib
-import dataclasses
 import json
 from pathlib import Path
 
@@ -12,15 +11,14 @@ import rich.table
 from benchmarks import ROWS
 from benchmarks.measure import Options, Row, reserve
 from jaxsense.config.options import Positional
-from jaxsense.config.section import check_fields, require
+from jaxsense.config.section import Checked, require
 from jaxsense.run import cli, devices, output
 
 PROGRAM = "benchmarks"
 _WIDTH_OF_FILES = 160
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Measures each stage, and with --peers those who do the same, and prints one table.
 
     Attributes:
@@ -35,8 +33,8 @@ class Arguments:
     json: Path | None = None
     quick: bool = False
 
-    def __post_init__(self):
-        check_fields(self)
+    def check(self) -> None:
+        """Checks the names of rows; raises `ConfigError`."""
         require(set(self.rows) <= set(ROWS), self, "rows", f"must be some of {', '.join(ROWS)}")
 
 

@@ -22,7 +22,7 @@ from scipy import stats
 from benchmarks import measure, peers
 from jaxsense import vae
 from jaxsense.config import JmvaeConfig
-from jaxsense.config.section import check_fields, limited
+from jaxsense.config.section import Checked, limited
 from jaxsense.core.networks import Params
 from jaxsense.run import cli
 from jaxsense.vae import Jmvae
@@ -203,8 +203,7 @@ def _cell(values: Sequence[float], digits: int) -> str:
     return f"{mean} ± {half:.{digits}f}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Trains JMVAEs on six views of digits, and prints one table.
 
     Attributes:
@@ -218,9 +217,6 @@ class Arguments:
     seeds: int = limited(5, at_least=1, at_most=100)
     steps: int = limited(Budget.steps, at_least=1)
     json: Path | None = None
-
-    def __post_init__(self):
-        check_fields(self)
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from jaxsense.config import ConfigError
 from jaxsense.config.options import Positional
-from jaxsense.config.section import check_fields, require
+from jaxsense.config.section import Checked, require
 from jaxsense.run import cli
 from jaxsense.summary.blocks import Results, Summary
 from jaxsense.summary.read import read_summary
@@ -126,8 +126,7 @@ def table(summaries: Iterable[Summary]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Prints the figures of finished runs, a column for each preset.
 
     Attributes:
@@ -135,9 +134,6 @@ class Arguments:
     """
 
     runs: Positional[tuple[Path, ...]] = ()
-
-    def __post_init__(self):
-        check_fields(self)
 
 
 def main(argv: list[str] | None = None) -> None:

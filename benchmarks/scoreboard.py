@@ -21,7 +21,7 @@ import jaxsense
 from benchmarks import measure, peers
 from benchmarks.dqn import Dqn
 from jaxsense.config.options import Positional
-from jaxsense.config.section import check_fields, limited, require
+from jaxsense.config.section import Checked, limited, require
 from jaxsense.run import cli
 from jaxsense.tasks import Recurrent, Task
 from jaxsense.tasks.score import Policy, estimate
@@ -63,8 +63,7 @@ def learners() -> tuple[Learner, ...]:
     return Dqn(), *(each for module in modules for each in module.LEARNERS)
 
 
-@dataclasses.dataclass(frozen=True)
-class Arguments:
+class Arguments(Checked):
     """Trains learners in the frozen tasks and prints the fractions of the best that they reach.
 
     Attributes:
@@ -83,8 +82,8 @@ class Arguments:
     json: Path | None = None
     quick: bool = False
 
-    def __post_init__(self):
-        check_fields(self)
+    def check(self) -> None:
+        """Checks the names of learners and tasks; raises `ConfigError`."""
         for field, known in (
             ("learners", [each.name for each in learners()]),
             ("only", sorted(name for name, _ in STEPS)),

@@ -29,7 +29,6 @@ from typing import (
 )
 
 import jax
-import numpy as np
 from jax.core import Tracer
 
 from jaxsense.core.checks import shown
@@ -117,6 +116,14 @@ def _fits(number: float, *, is_whole: bool) -> bool:
     return number == 0 or 1e-30 <= abs(number) <= 1e30
 
 
+def _beyond_32_bits(value: object) -> str:
+    """What else numbers must be that 32 bits do not hold."""
+    numbers = [x for x in jax.tree.leaves(value) if isinstance(x, int | float)]
+    whole = all(_fits(x, is_whole=True) for x in numbers if isinstance(x, int))
+    real = all(_fits(x, is_whole=False) for x in numbers if isinstance(x, float))
+    return ", below 2^31" * (not whole) + ", 0 or of magnitude 1e-30 to 1e+30" * (not real)
+
+
 def limited(default: T, **limits: float) -> T:
     """Declares a field with limits, which hold for each number in a tuple or a dictionary.
 
@@ -128,44 +135,20 @@ def limited(default: T, **limits: float) -> T:
     return cast(T, dataclasses.field(default=default, metadata={"limits": Limits(**limits)}))  # pyright: ignore[reportArgumentType]
 
 
-def require(condition: object, section: object, field: str, expected: str) -> None:
+def require(condition: object, section: "Checked", field: str, expected: str) -> None:
     """Raises a `ConfigError` about a field of a dataclass unless a condition holds."""
     if not condition:
-        raise ConfigError(_place(section, field), getattr(section, field), expected)
+        raise _error(section, field, expected)
+
+
+def _error(section: "Checked", field: str, expected: str) -> ConfigError:
+    return ConfigError(f"{section.PLACE}.{field}".lstrip("."), getattr(section, field), expected)
 
 
 def require_known(field: str, value: object, known: Iterable[str]) -> None:
     """Raises a `ConfigError` unless a value is one of the known names."""
     if value not in (names := [*known]):
         raise ConfigError(field, value, f"must be one of {', '.join(names)}")
-
-
-def _place(section: object, field: str) -> str:
-    """Name of a field, with its section."""
-    return f"{getattr(section, 'PLACE', '')}.{field}".lstrip(".")
-
-
-def check_fields(section: object) -> None:
-    """Checks the type and the limits of all fields of a dataclass, possibly frozen.
-
-    Values take their declared form: whole numbers become real where the type is `float`, lists
-    become tuples, and dictionaries become immutable.
-
-    Raises:
-      ConfigError: names the first invalid field.
-    """
-    for name, kind, limits, marks in fields_of(type(section)):
-        value = getattr(section, name)
-        try:
-            object.__setattr__(section, name, _converted(value, kind, limits, _LEAF in marks))
-        except TypeError:
-            expected = f"must be {described(kind, limits)}"
-            numbers = [x for x in jax.tree.leaves(value) if isinstance(x, int | float)]
-            if not all(_fits(x, is_whole=True) for x in numbers if isinstance(x, int)):
-                expected += ", below 2^31"
-            if not all(_fits(x, is_whole=False) for x in numbers if isinstance(x, float)):
-                expected += ", 0 or of magnitude 1e-30 to 1e+30"
-            raise ConfigError(_place(section, name), value, expected) from None
 
 
 @functools.cache
@@ -201,9 +184,9 @@ def _converted(value: object, kind: object, limits: Limits, is_leaf: bool = Fals
 
 def _scalar(value: object, kind: type, limits: Limits, is_leaf: bool) -> object:
     """A value of a class, as `_converted`."""
-    if is_leaf and isinstance(value, jax.Array | jax.ShapeDtypeStruct):
-        if not _is_unknown(value):
-            _scalar(cast(jax.Array, value).item(), kind, limits, is_leaf=False)
+    if is_leaf and (number := _number(value)) is not value:
+        if not isinstance(number, _Unknown):
+            _scalar(number, kind, limits, is_leaf=False)
         return value
     if kind in (int, float):
         # A whole number is real, and no truth value is a number.
@@ -249,8 +232,10 @@ def described(kind: object, limits: Limits) -> str:
 class Checked:
     """Base of frozen dataclasses that check their fields when they are made.
 
-    A subclass states its name as in `class LidarConfig(Section, place="lidar")`, which error
-    messages show before the name of a field.
+    Values take their declared form: whole numbers become real where the type is `float`, lists
+    become tuples, and dictionaries become immutable. A subclass states its name as in
+    `class LidarConfig(Section, place="lidar")`, which error messages show before the name of a
+    field.
     """
 
     PLACE: ClassVar[str] = ""
@@ -260,8 +245,14 @@ class Checked:
         dataclasses.dataclass(frozen=True)(cls)
 
     def __post_init__(self):
-        check_fields(self)
-        self.check()
+        for name, kind, limits, marks in fields_of(type(self)):
+            value = getattr(self, name)
+            try:
+                object.__setattr__(self, name, _converted(value, kind, limits, _LEAF in marks))
+            except TypeError:
+                expected = f"must be {described(kind, limits)}{_beyond_32_bits(value)}"
+                raise _error(self, name, expected) from None
+        jax.tree.map(_number, self).check()
 
     def check(self) -> None:
         """Checks relations between fields; raises `ConfigError`."""
@@ -284,10 +275,6 @@ class Section(Checked):
         cls.LEAVES = tuple(name for name in is_leaf if is_leaf[name])
         register(cls, cls.LEAVES, [name for name in is_leaf if not is_leaf[name]])
 
-    def __post_init__(self):
-        check_fields(self)
-        jax.tree.map(_number, self).check()
-
 
 class _Unknown:
     """A traced number: what it is compared with is right, what is computed from it unknown."""
@@ -304,15 +291,11 @@ class _Unknown:
 
 
 def _number(leaf: Any) -> Any:
-    """The number in a scalar array; `_Unknown` of other arrays."""
+    """The number in an array of one; `_Unknown` of a traced array or a batch."""
     if not isinstance(leaf, jax.Array | jax.ShapeDtypeStruct):
         return leaf
-    return _Unknown() if _is_unknown(leaf) else cast(jax.Array, leaf).item()
-
-
-def _is_unknown(value: object) -> bool:
-    """Whether a leaf is traced, or holds several numbers."""
-    return isinstance(value, Tracer | jax.ShapeDtypeStruct) or np.size(value) != 1  # pyright: ignore[reportArgumentType]
+    is_known = leaf.size == 1 and not isinstance(leaf, Tracer | jax.ShapeDtypeStruct)
+    return cast(jax.Array, leaf).item() if is_known else _Unknown()
 
 
 def require_function(field: str, value: object, number: int, expected: str) -> None:
