@@ -60,6 +60,16 @@ USAGE = """usage: python -m jaxsense.sail [OPTIONS] PORT [STOPS ...]
 A ship with two sails and a long
 description.
 """
+CREW = """  --crew INT
+      Number of people, if it is known.
+"""
+SAIL = """sail:
+  A sail of canvas.
+
+  --sail.area NUMBER
+      Its area, in square metres.
+      (default: 2.5)
+"""
 HELP = f"""{USAGE}
 options:
   PORT
@@ -74,38 +84,17 @@ options:
       What it is. (default: brig)
   --log PATH
       Its log book.
-  --crew INT
-      Number of people, if it is known.
-  --engine, --no-engine
+{CREW}  --engine, --no-engine
       Whether to use the engine.
       (default: on)
   --night, --no-night
       Whether to sail at night.
 
-sail:
-  A sail of canvas.
-
-  --sail.area NUMBER
-      Its area, in square metres.
-      (default: 2.5)
-  --sail.corners [INT ...]
+{SAIL}  --sail.corners [INT ...]
       Numbers of its corners. (default:
       1 2)
 """
-SHORT = f"""{USAGE}
-options:
-  --crew INT
-      Number of people, if it is known.
-
-sail:
-  A sail of canvas.
-
-  --sail.area NUMBER
-      Its area, in square metres.
-      (default: 2.5)
-
---help-all lists all 11 options.
-"""
+SHORT = f"{USAGE}\noptions:\n{CREW}\n{SAIL}\n--help-all lists all 11 options.\n"
 
 
 def test_the_help_describes_all_options_by_section_or_some(monkeypatch):
