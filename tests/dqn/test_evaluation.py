@@ -75,22 +75,18 @@ def test_the_kth_look_at_a_poi_sees_the_same_in_any_order():
     assert not np.isclose(twice, 2 * once)
 
 
-def every_state_by_enumeration(num_pois, num_classes, num_modalities):
-    """Rows of classes and looks, by `itertools` and in its order."""
-    # The first look changes fastest.
-    looks = [bits[::-1] for bits in itertools.product((0, 1), repeat=num_pois * num_modalities)]
-    every = itertools.product(range(num_classes), repeat=num_pois)
-    return [(*classes, *bits) for classes in every for bits in looks]
-
-
 @pytest.mark.parametrize(
     "sizes",
     # PoIs, classes, modalities: as many PoIs as classes, fewer, more; 4096 states.
     [(3, 3, 2), (2, 3, 2), (2, 5, 3), (4, 2, 1), (3, 1, 2), (6, 2, 1)],
 )
 def test_states_come_in_the_order_of_an_enumeration(sizes):
+    num_pois, num_classes, num_modalities = sizes
+    # The first look changes fastest.
+    looks = [bits[::-1] for bits in itertools.product((0, 1), repeat=num_pois * num_modalities)]
+    every = itertools.product(range(num_classes), repeat=num_pois)
+    expected = [(*classes, *bits) for classes in every for bits in looks]
     classes, seen = episodes.every_state(*sizes)
-    expected = every_state_by_enumeration(*sizes)
     np.testing.assert_array_equal(
         np.concatenate([classes, seen.reshape(len(seen), -1)], axis=1), expected
     )

@@ -119,8 +119,18 @@ def test_a_robot_that_sees_the_poi_looks_from_where_it_stands(chosen):
     state = chosen([0.0, 1.0, 0.0, 0.0])
     assert state.robots.view[0] == state.roadmap.viewpoints.shape[1]
     assert state.robots.path_left[0] == 0
-    # PoI 2 is 1.6 m away.
-    assert chosen([0.0, 0.0, 1.0, 0.0]).robots.view[0] < state.roadmap.viewpoints.shape[1]
+    # PoI 2 is 1.6 m away: .7 m to where it sees it from .9 m.
+    state = chosen([0.0, 0.0, 1.0, 0.0], change=lambda s: replace(s, steps=jnp.int32(50)))
+    assert state.robots.path_left[0] == pytest.approx(0.7, abs=0.05)
+    assert state.robots.progress_at[0] == state.time
+
+
+def test_a_robot_goes_on_to_its_viewpoint_if_its_target_stays(chosen, set_robot):
+    own = {"phase": DRIVING, "target": 2, "view": 5, "goals": 1, "path_left": 0.75}
+    change = lambda s: set_robot(seen_by([1, 1, 0])(s), 0, **own)  # noqa: E731
+    robots = chosen([0.0, 0.0, 1.0, 0.5], change=change).robots
+    assert robots.decided_on[0] == 2
+    assert {name: getattr(robots, name)[0] for name in own} == own
 
 
 def test_a_poi_without_any_viewpoint_is_given_up(chosen):
