@@ -13,7 +13,7 @@ from toys import PLACES, TRAVEL, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import starts
-from jaxsense.dqn.team import Team, Travel
+from jaxsense.dqn.team import Places, Team, Travel
 
 NOP, CAMERA, LIDAR = 3, 0, 1
 FIRST = 0.2 - 1 / np.sqrt(40)  # gain of a look, see `toys.classes_mdp`
@@ -180,6 +180,21 @@ def test_first_choices_go_round_the_robots_that_work():
     np.testing.assert_allclose([o.seconds for o in outcomes], [0, 0, 6], atol=1e-5)
     np.testing.assert_array_equal(states[2].team.poses[1], 0.0)  # that one takes no part
     assert states[2].seen[0, LIDAR]
+
+
+def test_pois_are_anywhere_in_cells_of_their_own_and_robots_anywhere():
+    places = Places((2.0, 4.0), 0.1, poi_pitch=0.6, num_pois=3, cells_per_side=2)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    positions, poses = jax.jit(jax.vmap(lambda key: places.draw(key, 2)))(keys)
+    # The sides are 2 to 4 m: cells of 1 to 2 m, of which a PoI keeps .3 m from either end.
+    for x in (positions, -positions):
+        assert 1.6 < x.max() < 1.7
+    assert 0.3 < jnp.abs(positions).min() < 0.31
+    apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+    assert apart[:, [0, 0, 1], [1, 2, 2]].min() > 0.6
+    for x in (poses, -poses):
+        np.testing.assert_allclose(x.max(axis=(0, 1)), [1.9, 1.9, jnp.pi], rtol=0.05)
+    assert jnp.abs(poses[..., :2]).max() < 1.9
 
 
 @jax.jit

@@ -10,12 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from toys import known_of, policy
 
 from jaxsense.config import MdpConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import optimum, rewards
-from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.rewards import Reward
 
 KEY = jax.random.key(0)
@@ -202,19 +200,6 @@ def test_values_on_labels_are_those_of_all_histories_of_classes(world):
     np.testing.assert_allclose(of_next(starts, True), alone, atol=error)
     np.testing.assert_allclose(of_all(starts, True), total, atol=error)
     assert total[0] > alone[0] + 0.05
-
-
-def test_the_policy_takes_the_look_of_the_highest_value_or_else_nop():
-    table = jnp.array(optimum.lattice(3)[:, 0]) - 0.5
-    values = LookValues(table, table, jnp.float32(0.15), jnp.float32(0.15))
-    act = jax.jit(policy("optimal", look_values=(values,)))
-    for first_classes, action in (((0.6, 0.7), 1), ((0.8, 0.7), 0), ((0.4, 0.49), 2)):
-        posterior = np.log([[p, (1 - p) / 2, (1 - p) / 2] for p in first_classes])
-        assert act(KEY, known_of(posterior, np.ones((2, 1)))) == action
-    # The first look at PoI 1 has a value of .15, and one at PoI 0 of .1 or .2.
-    for known, action in (((0.6, 0.2, 0.2), 1), ((0.7, 0.15, 0.15), 0)):
-        posterior = np.log([known, (1 / 3, 1 / 3, 1 / 3)])
-        assert act(KEY, known_of(posterior, [[1], [0]])) == action
 
 
 @pytest.mark.parametrize("horizon", [1, 8])

@@ -6,14 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import (
-    LATENT,
-    NAIVE,
-    POSES,
-    POSITIONS,
-    with_values,
-)
+from teams import LATENT, NAIVE, POSES, POSITIONS, with_values
 
+from jaxsense.mission import decide
 from jaxsense.mission.state import DRIVING, ENDED, FACING, IDLE
 
 
@@ -119,6 +114,10 @@ def test_a_robot_that_sees_the_poi_looks_from_where_it_stands(chosen):
     state = chosen([0.0, 1.0, 0.0, 0.0])
     assert state.robots.view[0] == state.roadmap.viewpoints.shape[1]
     assert state.robots.path_left[0] == 0
+    # Unless another robot stands in the view.
+    poses = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.4, 0.0]])
+    hidden = lambda s: replace(s, scene=replace(s.scene, poses=poses))  # noqa: E731
+    assert chosen([0.0, 1.0, 0.0, 0.0], change=hidden).robots.view[0] < state.robots.view[0]
     # PoI 2 is 1.6 m away: .7 m to where it sees it from .9 m.
     state = chosen([0.0, 0.0, 1.0, 0.0], change=lambda s: replace(s, steps=jnp.int32(50)))
     assert state.robots.path_left[0] == pytest.approx(0.7, abs=0.05)
@@ -131,6 +130,12 @@ def test_a_robot_goes_on_to_its_viewpoint_if_its_target_stays(chosen, set_robot)
     robots = chosen([0.0, 0.0, 1.0, 0.5], change=change).robots
     assert robots.decided_on[0] == 2
     assert {name: getattr(robots, name)[0] for name in own} == own
+
+
+def test_a_robot_that_has_ended_works_no_more(team, models, arena_of, set_robot):
+    state = set_robot(arena_of(POSITIONS, POSES), 1, phase=ENDED)
+    known = jax.jit(lambda state: decide.known_to(team, models, state, 0).team.works)
+    np.testing.assert_array_equal(known(state), [True, False])
 
 
 def test_a_poi_without_any_viewpoint_is_given_up(chosen):

@@ -74,6 +74,10 @@ def test_where_all_new_viewpoints_are_taken_a_robot_makes_room_and_tries_again(
         poses = there.scene.poses.at[1].set(jnp.array(other))
         return decides(values, replace(there, scene=replace(there.scene, poses=poses))).robots
 
+    # One that is occupied is a detour.
+    aside = decided(jnp.zeros_like(is_new), other=[*state.roadmap.viewpoints[0, first], 0.0])
+    assert (aside.phase[0], is_new[aside.view[0]]) == (DRIVING, True)
+    assert aside.view[0] != first
     # Of the new ones one is left; then none, but no robot is there: looks have shown nothing.
     assert decided(is_new.at[first].set(False)).view[0] == first
     again = decided(is_new, 1)

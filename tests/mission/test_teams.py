@@ -6,17 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import (
-    AHEAD,
-    CONFIG,
-    LATENT,
-    NAIVE,
-    POLICIES,
-    alone,
-    decide_alone,
-    starting,
-    with_values,
-)
+from teams import AHEAD, CONFIG, LATENT, NAIVE, POLICIES, alone, decide_alone, starting, with_values
 
 from jaxsense import mission
 from jaxsense.mission import act

@@ -35,9 +35,16 @@ def test_a_network_reads_from_an_observation_what_it_learns_from(name):
     is_whole = np.asarray(largest) < CLIP
     assert is_whole.sum() > 16
     np.testing.assert_allclose(found[is_whole], expected[is_whole], atol=1e-4)
-    if name == "team-v0":
-        features = found.reshape(32, -1, task.num_actions - 1)
-        assert set(np.unique(features[:, -3])) == {0.0, 1.0}
+
+
+def test_presence_is_read_without_rounding():
+    task, rng = make("team-v0"), np.random.default_rng(0)
+    seen = rng.normal(size=task.observation_size).astype(np.float32)
+    features = np.array(task.scaling.inverse(seen))
+    features[:, -3] = np.arange(len(features)) % 2
+    found = task.inputs(task.scaled(features)).reshape(features.T.shape)
+    np.testing.assert_array_equal(found[-3], features[:, -3])
+    np.testing.assert_allclose(found, features.T, atol=1e-4)
 
 
 def test_scaling_is_inverted():
