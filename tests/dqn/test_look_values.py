@@ -16,7 +16,6 @@ from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import optimum, rewards
 from jaxsense.dqn.rewards import Reward
 
-KEY = jax.random.key(0)
 HORIZON = 3
 interpolate = jax.jit(jax.vmap(optimum.interpolate, in_axes=(None, 0)))
 PRIOR = Belief(jnp.zeros(3), jnp.full(3, 2.0))

@@ -198,15 +198,13 @@ def test_gain_rate(times, gains, target, expected):
 
 def test_values_of_rules_as_worked_by_hand():
     gains, times = jnp.array([[0.8, 0.3, -1.0]]), jnp.array([[4.0, 2.0, 1.0]])
-    one = team(1)
-    found = policies.nearest(gains, times, one, jnp.int32(0))
-    # 1 / (1 + seconds)
-    np.testing.assert_allclose(found, [1 / 5, 1 / 3, -1, 0], rtol=1e-6)
-    found = policies.gain_rate(gains, times, one, jnp.int32(0))
-    np.testing.assert_allclose(found, [0.2, 0.15, -1, 0], rtol=1e-6)
-    # The auction's PoI is worth 1 more than in `nearest`.
-    found = policies.auction(gains, times, one, jnp.int32(0))
-    np.testing.assert_allclose(found, [1 / 5, 4 / 3, -1, 0], rtol=1e-6)
+    # 1 / (1 + seconds); the auction's PoI is worth 1 more than in `nearest`.
+    for rule, expected in (
+        (policies.nearest, [1 / 5, 1 / 3, -1, 0]),
+        (policies.auction, [1 / 5, 4 / 3, -1, 0]),
+        (policies.gain_rate, [0.2, 0.15, -1, 0]),
+    ):
+        np.testing.assert_allclose(rule(gains, times, team(1), jnp.int32(0)), expected, rtol=1e-6)
 
 
 def test_auctions_as_worked_by_hand():

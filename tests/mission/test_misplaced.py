@@ -105,13 +105,14 @@ def test_a_mission_starts_with_constant_errors(team, models):
         config = replace(CONFIG, mission=replace(CONFIG.mission, localisation=localisation))
         changed = with_config(team, config)
         states = jax.vmap(lambda key: mission.reset(key, changed, models))(keys)
-        return states.scene.poses, states.pose_error, states.believed_poses
+        return states.scene.poses, states.pose_error, states.believed_poses, states.classes
 
     keys = jax.random.split(jax.random.key(0), 64)
-    poses, errors, believed = begin(keys, localised)
+    poses, errors, believed, classes = begin(keys, localised)
     np.testing.assert_allclose(errors.std(axis=(0, 1)), [0.1, 0.1, np.radians(5.0)], rtol=0.3)
     np.testing.assert_allclose(believed, poses + errors, atol=1e-6)
+    assert set(np.ravel(classes)) == {0, 1, 2}
     # They change nothing else.
-    same, none, _ = begin(keys, LocalisationConfig())
+    same, none, *_ = begin(keys, LocalisationConfig())
     np.testing.assert_array_equal(same, poses)
     np.testing.assert_array_equal(none, 0.0)

@@ -74,7 +74,6 @@ def playing(*names):
         ("all", "must not be all, policies"),
         ("latent", "must not be latent, greedy, "),
         ("a/b", "must be a word of 1 to 64 letters"),
-        (" ", "must be a word of 1 to 64 letters"),
         ("", "must be a word of 1 to 64 letters"),
     ],
 )

@@ -97,6 +97,9 @@ def test_the_loss_is_the_mean_cross_entropy_of_both_kinds_of_looks():
     detector = linear([[0, 0, 0], [0, 0, 1], [0, 0, 0]], [0, 0, 0])
     looks = lambda *at: Looks(jnp.zeros((len(at), 1)), jnp.array(at))  # noqa: E731
     problem = detectors.problem(CONFIG, detector, looks(2.0, 0.5), jnp.array([0, 1]), looks(1.0))
+    rows, of_nothing = problem.draw(KEY, 4)
+    np.testing.assert_array_equal(np.unique(rows), [0, 1])
+    assert (rows.shape, of_nothing.shape) == ((4, 64), (4, 32))
     drawn = jnp.array([0, 1]), jnp.array([0])
     # -log sigmoid(2) = .126928, -log sigmoid(.5) = .474077, log 2 for the label; and
     # -log(1 - sigmoid(1)) = 1.313262.
@@ -232,3 +235,7 @@ def test_few_looks_teach_an_offset_and_keep_what_was_learned(trained):
     moved = jax.jit(detectors.retrain)(jax.random.key(7), detector, spoil(few), labels, config)
     assert accuracy(moved, spoil(others), of_others) > 0.97
     np.testing.assert_array_equal(detector.of(others)[-1], moved.of(others)[-1])
+    # Three quarters of the labels are wrong: those that are kept tell that this helps nothing.
+    wrong = jnp.where(jnp.arange(200) < 150, 1 - labels, labels)
+    same = retrain(jax.random.key(7), detector, few, wrong)
+    jax.tree.map(np.testing.assert_array_equal, same.params, detector.params)

@@ -81,14 +81,20 @@ def test_the_front_is_sought_as_far_as_the_bearing_may_be_wrong():
     window = cylinder(1.0, 0.108, radius=0.01)
     assert np.asarray(profile(window)).max() > 2 * EXTENT  # the pole, with nothing to its sides
     assert np.asarray(near_only(window)).max() < 0  # the wall behind
+    # At least to the next beams.
+    coarse = frames.profile(np.array([-0.2, 0.0, 0.2]), EXTENT, 0.0)
+    assert coarse.ahead == pytest.approx(np.sin(0.202))
 
 
 def test_what_stands_around_a_poi_does_not_turn_the_profile():
     """The middle is that of the beams on the PoI alone, whatever stands next to it."""
-    alone = cylinder(0.5, 0.0)
+    alone, usual = cylinder(0.5, 0.0), profile(cylinder(0.5, 0.0))
     aside = jnp.where((ANGLES > 0.25) & (ANGLES < 0.35), 0.8, alone)  # 0.3 m behind
     inside = np.abs(PLACES) < 0.08
-    np.testing.assert_allclose(profile(aside)[inside], profile(alone)[inside], atol=1e-6)
+    np.testing.assert_allclose(profile(aside)[inside], usual[inside], atol=1e-6)
     alone = cylinder(1.0, 0.0)
     far = jnp.where(ANGLES > 0.3, 1.0, alone)  # as near as the PoI, but 0.3 m to its side
     np.testing.assert_allclose(profile(far)[inside], profile(alone)[inside], atol=1e-6)
+    # Nor is one beam alone that falls short its front.
+    short, beside = cylinder(0.5, 0.0).at[len(ANGLES) // 2].set(0.2), np.abs(PLACES - 0.05) < 0.02
+    np.testing.assert_allclose(profile(short)[beside], usual[beside], atol=1e-3)
