@@ -51,6 +51,12 @@ def test_product_of_experts_by_hand():
     # A look that knows nothing changes nothing.
     found = gaussian.product_of_experts(of(1.0, 0.5), prior, prior)
     np.testing.assert_allclose([found.mean[0], found.std[0]], [1.0, 0.5], rtol=1e-6)
+    # Two that are wider than the prior leave as good as nothing.
+    found = gaussian.product_of_experts(of(0.0, 2.0), of(0.0, 2.0), prior)
+    np.testing.assert_allclose(found.std, [1000.0], rtol=1e-6)
+    # Of N(0, 1) and N(4, 9): (1 + 9) / 2 + 2^2 = 9.
+    found = gaussian.moment_match(Belief(jnp.array([[0.0], [4.0]]), jnp.array([[1.0], [3.0]])))
+    np.testing.assert_allclose([found.mean[0], found.std[0]], [2.0, 3.0], rtol=1e-6)
 
 
 def test_looks_by_hand():

@@ -52,6 +52,12 @@ def test_a_subset_without_an_encoder_has_the_product_of_its_modalities():
     np.testing.assert_allclose(parts["subsets"], [expected], rtol=1e-5)
 
 
+def test_a_scale_is_one_of_all_parameters():
+    init = jax.jit(lambda scale: jmvae.init(jax.random.key(0), TWO, scale=scale))
+    one, half = init(1.0), init(0.5)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(0.5 * x, y), one, half)
+
+
 def test_a_product_with_what_knows_nothing_stays_as_it_is():
     means, log_vars = jnp.array([[1.0]]), jnp.log(jnp.array([[0.5]]))
     # One alone stays as it is, and one wider than the prior takes nothing away from another.
@@ -169,11 +175,6 @@ FEATURES = (np.float32([0.3, -0.2]), np.float32([0.5, 0.1, -0.4]))
 estimate = jax.jit(jmvae.log_likelihood, static_argnames=("model", "samples"))
 
 
-@pytest.fixture(scope="module")
-def params():
-    return random_params(jmvae.init, LINEAR)
-
-
 def exact(params, present):
     """Features of linear decoders are normal: their moments follow from those of the latents."""
     layers = [params["decoders"][name]["params"]["Dense_0"] for name in LINEAR.modalities]
@@ -185,7 +186,8 @@ def exact(params, present):
 
 
 @pytest.mark.parametrize("present", [(0,), (1,), (0, 1)])
-def test_linear_decoders_have_a_likelihood_in_closed_form(params, present):
+def test_linear_decoders_have_a_likelihood_in_closed_form(present):
+    params = random_params(jmvae.init, LINEAR)
     features = tuple(x if m in present else None for m, x in enumerate(FEATURES))
     found = estimate(jax.random.key(1), params, LINEAR, features, WEIGHTS, samples=20_000)
     np.testing.assert_allclose(found, exact(params, present), atol=0.03)
