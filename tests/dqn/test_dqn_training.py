@@ -32,7 +32,6 @@ PROBE = DqnConfig(
 
 
 def learning_in(mdp, config):
-    """What an agent with the only sensor learns in."""
     return Environment(agent_of(mdp, config.hidden, config.discount), mdp)
 
 
@@ -152,18 +151,10 @@ def test_target_is_a_copy_from_the_last_multiple_of_its_period(chunks):
             assert not all(np.array_equal(x, y) for x, y in zip(leaves, before, strict=True))
 
 
-def train_small_once(key):
-    return training.train(key, LEARNING, SMALL)
-
-
-@pytest.fixture(scope="module")
-def train_small():
-    return jax.jit(train_small_once, compiler_options=FAST_TO_COMPILE)
-
-
-def test_training_in_one_call_equals_chunks_with_the_same_keys(chunks, train_small):
+def test_training_in_one_call_equals_chunks_with_the_same_keys(chunks):
     all_states, infos = chunks
-    state, info = train_small(jax.random.key(0))
+    train = lambda key: training.train(key, LEARNING, SMALL)  # noqa: E731
+    state, info = jax.jit(train, compiler_options=FAST_TO_COMPILE)(jax.random.key(0))
     chex.assert_trees_all_close((state, info), (all_states[-1], infos), rtol=1e-5, atol=1e-6)
 
 
@@ -250,15 +241,10 @@ def train_from_epoch_5(config, evaluate):
     return training.train_chunk(jax.random.key(1), LEARNING, config, state, prepared, evaluate)
 
 
-def trained_for(chunk, evaluate, **settings):
-    """The state and the infos after one chunk of a small training, which begins at epoch 5."""
-    return train_from_epoch_5(replace(SMALL, epochs=chunk, **settings), evaluate)
-
-
 def test_the_policy_is_evaluated_after_every_tenth_epoch():
     # The target network is a copy of the parameters after epochs 15, 30 and so on: in a chunk that
     # begins after epoch 5 and ends after epoch 25, of those after its tenth.
-    state, infos = trained_for(20, length_of, target_period=15)
+    state, infos = train_from_epoch_5(replace(SMALL, epochs=20, target_period=15), length_of)
     np.testing.assert_array_equal(np.flatnonzero(~np.isnan(infos.evaluation_return)), [9, 19])
     found = infos.evaluation_return[jnp.array([9, 19])]
     expected = [length_of(None, params) for params in (state.target, state.params)]

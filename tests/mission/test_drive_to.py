@@ -53,6 +53,17 @@ def test_arcs_are_those_of_a_unicycle(turn_rate):
     np.testing.assert_allclose(np.stack([x, y, cos, sin], axis=1), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("least", "seconds"), [(0.1, 0.0), (0.05, 0.05), (0.02, 0.08), (0.0, 0.1), (-0.1, 0.1)]
+)
+def test_an_arc_that_has_come_near_something_takes_longer(least, seconds):
+    arcs = arcs_of(0.0, PERIOD)
+    arrival = lambda room: navigation._arrival(arcs, jnp.float32(1), jnp.float32(0), room)  # noqa: E731
+    free = jnp.ones_like(arcs.x)
+    found = arrival(free.at[:, 2].set(least)) - arrival(free)
+    np.testing.assert_allclose(found, np.tile([0, 0] + [seconds] * 4, (len(found), 1)), atol=1e-6)
+
+
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 @pytest.mark.parametrize(
     ("goal", "expected"),
@@ -279,6 +290,8 @@ def at(distance, degrees):
 )
 def test_a_robot_in_the_way_is_passed_on_the_shorter_side(sidestep, other, expected):
     np.testing.assert_allclose(sidestep([other]), expected, atol=1e-5)
+    # The last of several counts.
+    np.testing.assert_allclose(sidestep([(0.4, 0.0), other]), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -53,13 +53,9 @@ def test_a_robot_that_searches_looks_from_farther_away(team, facing):
         return decide.views(robot, jnp.int32(0), state.roadmap.viewpoints[0])[1]
 
     for position, expected in ((0.0, True), (0.04, True), (0.06, False)):
-        assert bool(sees(searching(Search(position=position)), state)) is expected
-
-
-def searching(search):
-    """Settings of missions in which robots search."""
-    localisation = LocalisationConfig(search=search)
-    return replace(CONFIG, mission=replace(CONFIG.mission, localisation=localisation))
+        localised = LocalisationConfig(search=Search(position=position))
+        config = replace(CONFIG, mission=replace(CONFIG.mission, localisation=localised))
+        assert bool(sees(config, state)) is expected
 
 
 def test_a_robot_arrives_where_it_believes_the_viewpoint_to_be(team, models, facing, set_robot):

@@ -9,6 +9,7 @@ import pytest
 from teams import AHEAD, CONFIG
 
 from jaxsense import mission
+from jaxsense.mission.rollout import _is_near
 from jaxsense.mission.rollout import move as move_all
 from jaxsense.sim import amiro
 
@@ -46,6 +47,27 @@ def move(team):
 def way(before, after):
     """How far the camera robots have driven on."""
     return after.scene.poses[:, 0, 0] - before.scene.poses[:, 0, 0]
+
+
+def test_contacts_are_simulated_where_anything_can_be_touched(arena_of):
+    layout = arena_of(AHEAD, [[0.0, 0.0, 0.0], [0.0, 1.2, 0.0]]).scene.layout
+    # Gaps to the wall and between the robots: each drives .02 m, and may be .005 m ahead of that.
+    gaps = np.array([[0.024, 1.0], [0.026, 1.0], [1.0, 0.044], [1.0, 0.046]])
+    first = 1.5 - amiro.BODY_RADIUS - gaps[:, 0]
+    x = np.stack([first, first - 2 * amiro.BODY_RADIUS - gaps[:, 1]], axis=1)
+    poses = jnp.array(np.stack([x, np.full_like(x, 0.4), np.zeros_like(x)], axis=-1), jnp.float32)
+    layouts = jax.tree.map(lambda x: jnp.stack([x] * 4), layout)
+    near = jax.jit(lambda layouts, poses: _is_near(CONFIG, layouts, poses))(layouts, poses)
+    np.testing.assert_array_equal(near, [True, False, True, False])
+
+
+def test_periods_of_contact_are_counted(team, pushing, monkeypatch):
+    # Without the physics, which takes long to compile: clear of everything, and in contact.
+    clearance = lambda *given: (given[2], given[2].poses[:, 0, 0] - 0.6)  # noqa: E731
+    monkeypatch.setitem(_is_near.__globals__, "_integrate", clearance)
+    before = replace(pushing(0.03, 0.1), contacts=jnp.array([2, 2], jnp.int32))
+    after = jax.jit(lambda states: move_all(team, states))(before)
+    np.testing.assert_array_equal(after.contacts, [2, 3])
 
 
 @pytest.mark.slow  # compiles contacts

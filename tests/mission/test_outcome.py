@@ -65,10 +65,6 @@ def test_figures_as_worked_by_hand(team, known, ended):
     assert unseen["told"]["camera"] == 0
 
 
-def one(flag_of, robot, poi):
-    return flag_of.at[robot, poi].set(True)
-
-
 @pytest.mark.parametrize(
     ("expected", "change"),
     [
@@ -93,7 +89,7 @@ def _phases(state, *phases):
 
 
 def _flags(state, name):
-    flags = one(getattr(state.robots, name), 1, 2)
+    flags = getattr(state.robots, name).at[1, 2].set(True)
     return replace(state, robots=replace(state.robots, **{name: flags}))
 
 

@@ -180,6 +180,7 @@ def test_a_robot_that_stops_leaves_the_other_one_working(played, robot):
     _, end, record = played[0][f"{robot} stops"]
     assert np.all(end.robots.phase[:, robot] == FAILED)
     assert np.all(end.robots.phase[:, 1 - robot] == ENDED)
+    assert np.all(end.robots.target == NUM_POIS)
     after = record.time[0] > FAULT_TIME + 0.5
     assert not record.detected[:, after, robot].any()
     assert np.all(record.command[:, after, robot] == 0)

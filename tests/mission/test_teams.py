@@ -39,14 +39,10 @@ def scan(many, models):
     )
 
 
-def facing(state, set_robot, robot, target):
-    return set_robot(state, robot, phase=FACING, target=target, progress_at=-100.0)
-
-
 def test_robots_with_the_same_sensor_write_as_one_modality(scan, start_of, set_robot):
     state = start_of()
     for robot in (FIRST, SECOND, LIDAR):
-        state = facing(state, set_robot, robot, robot)
+        state = set_robot(state, robot, phase=FACING, target=robot, progress_at=-100.0)
         state = scan(jax.random.key(robot), state, jnp.int32(robot))
     np.testing.assert_array_equal(state.times_seen, [[1, 0], [1, 0], [0, 1]])
     np.testing.assert_array_equal(state.robots.looks, [1, 1, 1])

@@ -152,6 +152,11 @@ def test_noise_is_fitted_without_bias():
     assert found.mixed_pixels == pytest.approx(0.3, abs=0.025)
     assert found.dropout == pytest.approx(0.01, abs=0.0005)
     assert found.max_range == given.max_range
+    # What is beyond its range counts for nothing: more noise, an edge that is always mixed, gaps.
+    far = (3.0 * depth + 0.02 * rng.normal(size=(3000, 181)))[:, ::-1]
+    far[:, 90] = rng.uniform(6.5, 8.5, 3000)
+    far[rng.uniform(size=far.shape) < 0.1] = np.inf
+    assert recorded.fit_noise(given, AHEAD, np.concatenate([ranges, far])) == found
     # Some drivers write 0 for no return.
     assert recorded.fit_noise(given, AHEAD, np.where(np.isinf(ranges), 0, ranges)) == found
 
