@@ -26,6 +26,7 @@ def test_a_mixture_has_the_moments_by_hand():
     found = mixture(CLASSES, jnp.array([0.5, 0.5, 0.0]))
     np.testing.assert_allclose(found.mean, [0.2, 0.9], atol=1e-6)
     np.testing.assert_allclose(found.std, [np.sqrt(0.16 + 1.0), 0.4], atol=1e-6)
+    np.testing.assert_allclose(readout.sigma_norm(jnp.array([[3.0, 4.0], [6.0, 8.0]])), [5, 10])
 
 
 @pytest.mark.parametrize("variance", [20.0, 0.01])
