@@ -31,6 +31,7 @@ _SCENES_AT_ONCE = 512
 _ROUNDING = 1e-5
 _ROBOTS_EACH = 2  # of each modality in a random team, at most
 _MOST_CHOICES = 300  # in an episode of a team
+_AS_FAR = 16  # one in so many looks at a class counts as from about as far
 _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 
@@ -51,18 +52,30 @@ class Live:
         return worlds.random_scene(key, self.world, classes)
 
     def observe(
-        self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
+        self,
+        key: Key,
+        scene: Scene,
+        poi: Int[Array, ""],
+        modality: int,
+        distance: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, " D_m"], Scene]:
-        """Puts a robot at a random viewpoint of a PoI and scans, see `Looks.observe`."""
+        """Puts a robot at a random viewpoint of a PoI and scans, at whatever distance."""
+        del distance
         look, scene = worlds.look(key, self.world, scene, modality, poi)
         return detectors.features(self.detectors[modality], *look), scene
 
 
 @pytree
 class Bank:
-    """Draws looks from stored features; a scene holds only the classes of the PoIs."""
+    """Draws looks from stored features; a scene holds only the classes of the PoIs.
+
+    Attributes:
+      distances: for each modality `[C, S]` metres from which the looks are, in rising order of each
+        class, see `by_distance`; None if any look stands for any distance.
+    """
 
     features: Samples
+    distances: tuple[Float[Array, "C S"], ...] | None = None
 
     @property
     def num_modalities(self) -> int:
@@ -75,13 +88,31 @@ class Bank:
         return classes
 
     def observe(
-        self, key: Key, scene: Int[Array, " N"], poi: Int[Array, ""], modality: int
+        self,
+        key: Key,
+        scene: Int[Array, " N"],
+        poi: Int[Array, ""],
+        modality: int,
+        distance: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, " D_m"], Int[Array, " N"]]:
-        """Draws a look at the PoI's class, see `Looks.observe`."""
-        samples = self.features[modality]
+        """Draws a look at the PoI's class from about as far, see `Looks.observe`."""
+        samples, which = self.features[modality], scene[poi]
         # A key from a split is as random as a draw from it.
-        row = jax.random.key_data(key)[-1] % samples.shape[1]
-        return samples[scene[poi], row], scene
+        draw, number = jax.random.key_data(key)[-1], samples.shape[1]
+        row = draw % number
+        if self.distances is not None:
+            near = -(-number // _AS_FAR)
+            rank = jnp.searchsorted(self.distances[modality][which], distance)
+            first = jnp.clip(rank - near // 2, 0, number - near)
+            row = jnp.where(jnp.asarray(distance) > 0, first + draw % near, row)
+        return samples[which, row], scene
+
+
+def by_distance(features: Samples, distances: tuple[Float[Array, "C S"], ...]) -> Bank:
+    """A bank whose looks depend on the distance."""
+    ranked = lambda x, far: x[jnp.arange(len(x))[:, None], jnp.argsort(far, axis=1)]  # noqa: E731
+    taken = tuple(map(ranked, features, distances))
+    return Bank(taken, tuple(jnp.sort(far, axis=1) for far in distances))
 
 
 def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:

@@ -109,7 +109,7 @@ def run_episode(
         def of_look(m: int) -> jax.Array:
             # The same key yields the same look as in the step.
             place = jnp.minimum(poi, mdp.num_pois - 1)
-            features, _ = mdp.looks.observe(look_key, state.scene, place, m)
+            features, _ = mdp.looks.observe(look_key, state.scene, place, m, outcome.distance)
             return exact.log_likelihoods(features, m)
 
         found = call(of_look, modality, mdp.num_modalities)

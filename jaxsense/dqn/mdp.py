@@ -18,7 +18,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from jaxsense.config import MdpConfig
 from jaxsense.core import checks
@@ -54,9 +54,17 @@ class Looks(Protocol):
         ...
 
     def observe(
-        self, key: Key, scene: Scene, poi: Int[Array, ""], modality: int
+        self,
+        key: Key,
+        scene: Scene,
+        poi: Int[Array, ""],
+        modality: int,
+        distance: Float[Array, ""] | float,
     ) -> tuple[Float[Array, " L"], Scene]:
         """Looks at a PoI.
+
+        Args:
+          distance: from the PoI, in metres; 0 without travel, for a look from anywhere.
 
         Returns:
           `[D_m]` features, and the scene after the look.
@@ -208,6 +216,7 @@ class Outcome:
       truncated: `[]` bool, the episode has reached its limit of steps.
       seconds: `[]` that passed; without travel, 1 for a look.
       poi: `[]` int32 that was looked at; N for none.
+      distance: `[]` from which, in metres; see `Looks.observe`.
     """
 
     reward: jax.Array
@@ -215,6 +224,7 @@ class Outcome:
     truncated: jax.Array
     seconds: jax.Array
     poi: jax.Array
+    distance: jax.Array
 
 
 @checks.typed
@@ -253,7 +263,9 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     looked = jnp.where(is_looker, 0.0, jnp.minimum(looked, mdp.travel.look_seconds))
     moved = jax.vmap(mdp.travel.move, (0, 0, None, 0))(team.poses, goals, seconds, to_go)
     poi = jnp.where(passes, target[looker], nop)
-    changed, reward = _look(key, mdp, state, poi, looker, moved[looker])
+    place = moved[looker, :2]
+    distance = jnp.linalg.norm(place - team.positions[jnp.minimum(poi, nop - 1)])
+    changed, reward = _look(key, mdp, state, poi, looker, place, distance)
 
     following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
     after = dataclasses.replace(
@@ -272,7 +284,7 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
         seconds=state.seconds + seconds,
     )
     truncated = ~terminated & (after.steps >= mdp.config.max_steps)
-    return after, Outcome(reward, terminated, truncated, seconds, poi)
+    return after, Outcome(reward, terminated, truncated, seconds, poi, distance)
 
 
 def _look(
@@ -281,7 +293,8 @@ def _look(
     state: State,
     poi: Int[Array, ""],
     looker: Int[Array, ""],
-    pose: Float[Array, "3"],
+    stands: Float[Array, "2"],
+    distance: Float[Array, ""],
 ) -> tuple[dict[str, PyTree], Float[Array, ""]]:
     """What a robot's look changes, or NOP, and the `[]` reward."""
     is_nop, place = poi == mdp.num_pois, jnp.minimum(poi, mdp.num_pois - 1)
@@ -289,13 +302,13 @@ def _look(
     modality, weight, looked_from = mdp.sensor(state.team, looker), 1.0, state.looked_from
     if mdp.novelty is not None and looked_from is not None:
         earlier = looked_from[place, modality]
-        weight = mdp.novelty.weight(_apart(pose[:2], earlier), modality)
-        here = jnp.where(is_there(pose[:2], state.team.positions[place]), NEVER, pose[:2])
+        weight = mdp.novelty.weight(_apart(stands, earlier), modality)
+        here = jnp.where(distance > 0, stands, NEVER)
         latest = jnp.concatenate([here[None], earlier[:-1]])
         looked_from = looked_from.at[place, modality].set(latest)
 
     def look(modality: int) -> tuple[Belief, Scene]:
-        features, scene = mdp.looks.observe(key, state.scene, place, modality)
+        features, scene = mdp.looks.observe(key, state.scene, place, modality, distance)
         return mdp.fusion.update(old, state.seen[place], features, modality, weight), scene
 
     if mdp.is_single:
@@ -337,11 +350,6 @@ def _to_go(
         return jnp.where(is_left, -1.0, 1.0) * novelty.to_go(apart, modality)
 
     return jax.vmap(of_robot)(team.poses, team.modality, target, goals)
-
-
-def is_there(place: Float[Array, "2"], positions: Float[Array, "*S 2"]) -> Bool[Array, "*S"]:
-    """Whether a robot is where PoIs are, as one without travel is."""
-    return jnp.all(positions == jnp.broadcast_to(place, positions.shape), axis=-1)
 
 
 def _apart(place: Float[Array, "2"], places: Float[Array, "K 2"]) -> Float[Array, " K"]:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core import checks
 from jaxsense.core.types import Belief, Key, Scene
-from jaxsense.dqn.mdp import NEVER, RECENT, Mdp, State, is_there
+from jaxsense.dqn.mdp import NEVER, RECENT, Mdp, State
 from jaxsense.dqn.team import Team, Travel, alone
 
 
@@ -80,9 +80,10 @@ def reset_with_looks(
     chex.assert_shape(classes, (mdp.num_pois,))
     checks.require_index("classes", classes, mdp.num_classes)
     scene = mdp.looks.scene(scene_key, classes)
+    far = 0.0 if mdp.teams is None else _view_distance(mdp.teams.travel, team)
     pois = jnp.arange(mdp.num_pois)
     looks = tuple(
-        jax.vmap(lambda key, poi: mdp.looks.observe(key, scene, poi, m)[0])(keys, pois)  # noqa: B023
+        jax.vmap(lambda key, poi: mdp.looks.observe(key, scene, poi, m, far)[0])(keys, pois)  # noqa: B023
         for m, keys in enumerate(jax.random.split(look_key, (mdp.num_modalities, mdp.num_pois)))
     )
     return begin(begin_key, mdp, team, scene, classes, seen, looks), looks
@@ -133,11 +134,17 @@ def _earlier(
     """Places of the looks before the start: random ones in view of their PoIs."""
     angle = jax.random.uniform(key, seen.shape, maxval=2 * jnp.pi)
     around = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    places = team.positions[:, None] + travel.view_distance * around
+    far = _view_distance(travel, team)
+    places = team.positions[:, None] + far * around
     # Looks of a robot that is where the PoIs are do not repeat each other.
-    counts = seen & ~is_there(team.poses[0, :2], team.positions)[:, None]
-    last = jnp.where(counts[..., None], places, NEVER)
+    last = jnp.where((seen & (far > 0))[..., None], places, NEVER)
     return jnp.full((*seen.shape, RECENT, 2), NEVER).at[:, :, 0].set(last)
+
+
+def _view_distance(travel: Travel, team: Team) -> Float[Array, ""]:
+    """Metres from which robots have looked at PoIs; 0 if they are where the PoIs are."""
+    is_there = jnp.all(team.positions == team.poses[0, :2][None])
+    return jnp.where(is_there, 0.0, travel.view_distance)
 
 
 def _looked_at(mdp: Mdp, looks: tuple[jax.Array, ...], seen, first) -> Belief:

@@ -171,11 +171,13 @@ class Detections:
       bank: for each modality `[C, S, D_m]` features for training.
       held_out: for each modality `[C, S', D_m]` features of other scenes, to measure on.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
+      by_distance: the bank for robots that travel.
     """
 
     bank: Samples
     held_out: Samples
     windows: tuple[Float[Array, "C 1 F"], ...]
+    by_distance: looks.Bank
 
 
 def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Looks, ...]:
@@ -288,9 +290,12 @@ def detect(
         num_classes = len(config.arena.classes)
         return tuple(looks.by_class(x, classes, num_classes, number) for x in values)
 
-    of_bank, classes = features(bank), bank.classes if shown is None else shown.bank
+    classes = bank.classes if shown is None else shown.bank
+    given = features(bank), tuple(jnp.swapaxes(bank.distances, 0, 1))
+    found = [by_class(x, classes, config.jmvae.samples_per_class) for x in given]
     return Detections(
-        bank=by_class(of_bank, classes, config.jmvae.samples_per_class),
+        bank=found[0],
+        by_distance=looks.by_distance(*found),
         held_out=by_class(features(held_out), held_out.classes, held_out_per_class(config)),
         windows=by_class(held_out.windows, held_out.classes, 1),
     )

@@ -21,15 +21,23 @@ AWAY = 0.5 * math.sqrt(-2 * math.log(math.sqrt(2) - 1))
 
 
 @pytree
+class Far(Certain):
+    """A look shows how far it is from its PoI."""
+
+    def observe(self, key, scene, poi, modality, distance):
+        return jnp.reshape(jnp.float32(distance), 1), scene
+
+
+@pytree
 class Weighing(Toy):
-    """A look adds to the information what of it is new."""
+    """A look adds to the information what of it is new, and writes what it shows."""
 
     def update(self, belief, seen, features, modality, weight=1.0):
-        return Belief(belief.mean, 1.0 / (1.0 / belief.std + weight))
+        return Belief(features, 1.0 / (1.0 / belief.std + weight))
 
 
 def team_of(*robots, **given):
-    mapped = make_mdp(Certain(), Weighing(Belief(*jnp.ones((2, 1))), 3), 3, min_increase=0.0)
+    mapped = make_mdp(Far(), Weighing(Belief(*jnp.ones((2, 1))), 3), 3, min_increase=0.0)
     places = Fixed(PLACES, jnp.zeros((len(robots), 3)))
     given = {"partly_seen": 0.0, "novelty": NOVELTY, "num_pois": (3, 3), **given}
     return team_mdp_of(mapped, places, robots=robots, **given)
@@ -55,6 +63,7 @@ def test_a_robot_goes_round_a_poi_to_where_its_look_is_new(sensor, away, new):
     angle = 2 * math.asin(away / 2 / 0.9)
     place = [1.9 - 0.9 * math.cos(angle), -0.9 * math.sin(angle)]
     np.testing.assert_allclose(second.team.poses[0], [*place, angle], atol=1e-4)
+    np.testing.assert_allclose([second.belief.mean[0, 0], twice.distance], 0.9, rtol=1e-4)
     here = second.looked_from[0, sensor, :2]
     np.testing.assert_allclose(here, [place, [1.0, 0.0]], atol=1e-4)
 
@@ -99,6 +108,7 @@ def test_looks_of_a_robot_alone_are_all_new():
     found = play(team_of(CAMERA, LIDAR, alone=1.0), 0, 0, 0)
     np.testing.assert_allclose([outcome.reward for _, outcome in found], 1.0, rtol=1e-5)
     np.testing.assert_allclose([outcome.seconds for _, outcome in found], 1.0, rtol=1e-5)
+    assert (found[-1][0].belief.mean[0, 0], found[-1][1].distance) == (0.0, 0.0)  # from anywhere
 
 
 def test_looks_before_the_start_were_in_view_of_their_pois():
@@ -109,6 +119,7 @@ def test_looks_before_the_start_were_in_view_of_their_pois():
     away = np.asarray(state.looked_from - PLACES[None, :, None, None])
     apart = np.linalg.norm(away, axis=-1)
     np.testing.assert_allclose(apart[..., 0][:, seen], 0.9, rtol=1e-5)
+    np.testing.assert_allclose(state.belief.mean[:, [0, 2], 0], 0.9, rtol=1e-5)
     assert (apart[..., 1:] > 1e5).all()
     assert (apart[..., 0][:, ~seen] > 1e5).all()
     # From all around: a mean of 300 has a deviation of .9 / sqrt(600) = .037.

@@ -72,7 +72,7 @@ class Shown(Certain):
     def scene(self, key, classes):
         return jnp.float32(1.0)
 
-    def observe(self, key, scene, poi, modality):
+    def observe(self, key, scene, poi, modality, distance):
         return scene[None], scene
 
 

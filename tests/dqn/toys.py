@@ -32,7 +32,7 @@ class Certain:
     def scene(self, key, classes):
         return classes
 
-    def observe(self, key, scene, poi, modality):
+    def observe(self, key, scene, poi, modality, distance):
         return jnp.stack([scene[poi], modality]).astype(jnp.float32), scene
 
 
@@ -40,7 +40,7 @@ class Certain:
 class Uniform(Certain):
     """A look shows a random number that only its key decides."""
 
-    def observe(self, key, scene, poi, modality):
+    def observe(self, key, scene, poi, modality, distance):
         return jax.random.uniform(key, (1,)), scene
 
 
