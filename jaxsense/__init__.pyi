@@ -18,6 +18,7 @@ from .core.types import Transition as Transition
 from .core.types import pytree as pytree
 from .looks import Bank as Bank
 from .looks import Live as Live
+from .looks import bank as bank
 from .looks import detections as detections
 from .looks import make_mdp as make_mdp
 from .models import Models as Models

@@ -110,9 +110,11 @@ class Bank:
 
 def by_distance(features: Samples, distances: tuple[Float[Array, "C S"], ...]) -> Bank:
     """A bank whose looks depend on the distance."""
-    ranked = lambda x, far: x[jnp.arange(len(x))[:, None], jnp.argsort(far, axis=1)]  # noqa: E731
-    taken = tuple(map(ranked, features, distances))
-    return Bank(taken, tuple(jnp.sort(far, axis=1) for far in distances))
+    ranked = [
+        x[jnp.arange(len(x))[:, None], jnp.argsort(far, axis=1)]
+        for x, far in zip(features, distances, strict=True)
+    ]
+    return Bank(tuple(ranked), tuple(jnp.sort(far, axis=1) for far in distances))
 
 
 def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
@@ -305,6 +307,19 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     Raises:
       ValueError: if `samples` is not positive, or looks lie outside the detectors' domains.
     """
+    return _simulated(key, config, models, samples)[0]
+
+
+@checks.typed
+def bank(key: Key, config: Config, models: Models, samples: int) -> Bank:
+    """Simulated looks by distance, from which robots that travel learn; see `detections`."""
+    return by_distance(*_simulated(key, config, models, samples))
+
+
+def _simulated(
+    key: Key, config: Config, models: Models, samples: int
+) -> tuple[Samples, tuple[Float[Array, "C S"], ...]]:
+    """Features of looks, and metres from which they are."""
     checks.require_number("samples", samples)
     num_classes = len(config.arena.classes)
     world = worlds.make_world(config)
@@ -312,12 +327,13 @@ def detections(key: Key, config: Config, models: Models, samples: int) -> Sample
     number = -(-samples * num_classes // config.arena.num_pois)
 
     @jax.jit
-    def look(key: Key, world: World, models: Models) -> Samples:
+    def look(key: Key, world: World, models: Models) -> tuple[Samples, Samples]:
         class_key, survey_key = jax.random.split(key)
         classes = balanced_classes(class_key, config, number)
         keys, is_empty = jax.random.split(survey_key, number), jnp.zeros(number, bool)
         seen, distances = surveys(keys, world, classes, is_empty)
-        found = features(models.detectors, seen, distances)
-        return tuple(by_class(x, classes, num_classes, samples) for x in found)
+        found = features(models.detectors, seen, distances), tuple(jnp.swapaxes(distances, 0, 1))
+        sort = lambda x: by_class(x, classes, num_classes, samples)  # noqa: E731
+        return jax.tree.map(sort, found)
 
     return look(key, world, models)

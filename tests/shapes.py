@@ -49,7 +49,7 @@ def main() -> None:
     team = dataclasses.replace(
         TINY,
         jmvae=dataclasses.replace(TINY.jmvae, fusion="filter"),
-        dqn=dataclasses.replace(TINY.dqn, task="team", observe="bank"),
+        dqn=dataclasses.replace(TINY.dqn, task="team"),
     )
     for config in (TINY, team):
         jax.eval_shape(lambda key: jaxsense.learn(key, config), KEY)  # noqa: B023

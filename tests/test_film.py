@@ -120,14 +120,6 @@ def test_what_moves_in_straight_lines_is_told_by_their_ends():
     assert 10 < len(tracks(element)[1].times) < 60
 
 
-def test_pois_are_drawn_in_their_size(picture):
-    # Radius 0.1 m at 340 px for 3 m is 11.33 px; the half sides of both shapes are whole radii.
-    circles = [e.get("r") for e in picture.iter(f"{SVG}circle") if e.get("r") == "11.33"]
-    boxes = [e for e in picture.iter(f"{SVG}rect") if "rotate" in e.get("transform", "")]
-    assert len(circles) == 2
-    assert [(e.get("x"), e.get("width")) for e in boxes] == [("-11.33", "22.67")]
-
-
 def test_robots_and_beliefs_are_where_they_were(picture):
     # 340 px for 3 m: from the middle to 1 m right of it.
     (start, end) = ([170.0, 170.0], [170 + 340 / 3, 170.0])

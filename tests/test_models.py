@@ -19,7 +19,7 @@ SMOKE, KEY = PRESETS["smoke"], jax.random.key(0)
 SCANS = replace(SMOKE, jmvae=replace(SMOKE.jmvae, learns_from="scans", fusion="filter"))
 TEAM = replace(
     SMOKE,
-    dqn=replace(SMOKE.dqn, task="team", observe="bank"),
+    dqn=replace(SMOKE.dqn, task="team"),
     team=replace(SMOKE.team, num_pois=(3, 7)),
 )
 CAMERA, LIDAR = sensors.make(SMOKE)

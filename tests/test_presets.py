@@ -122,14 +122,6 @@ def test_raw_preset(default, seed, tmp_path, summary_of):
     assert raw["timing"]["total_s"] <= 240
 
 
-def test_live_and_bank_train_equally_good_policies(default, seed, tmp_path, summary_of):
-    # The same seed trains the same detectors and the same JMVAE, so that rewards are comparable.
-    bank = summary_of("default", seed, tmp_path / "bank", "--dqn.observe", "bank")
-    assert bank["jmvae"] == default["jmvae"]
-    for modality, block in bank["dqn"].items():
-        assert block["return"] == pytest.approx(default["dqn"][modality]["return"], rel=0.01)
-
-
 def test_missions_with_the_default_preset(default, default_run, run_program):
     options = str(default_run), "--episodes", "1024"
     run_program("evaluate", default_run, *options)
@@ -147,7 +139,9 @@ def test_missions_with_the_default_preset(default, default_run, run_program):
 
 
 def test_noisy_preset(tmp_path, summary_of):
-    noisy = summary_of("noisy", 0, tmp_path / "noisy")
+    names = "latent", "naive", "naive_3"
+    policies = "--mission.policies", *names, "--mission.episodes", "64"
+    noisy = summary_of("noisy", 0, tmp_path / "noisy", *policies)
     belief = noisy["belief"]
     assert belief["looks"] == [1, 2, 3, 4, 5, 6]
     for found, exact in zip(belief["nll"], belief["bayes_nll"], strict=True):
@@ -157,8 +151,12 @@ def test_noisy_preset(tmp_path, summary_of):
     assert belief["doubt_correlation"] >= 0.95
     for block in noisy["dqn"].values():
         assert 0.98 <= block["fraction_of_optimal"] <= 1.01
-    assert noisy["mission"]["latent"]["accuracy"] >= 0.97
     assert all(block["ece"] <= 0.02 for block in noisy["detectors"].values())
+    latent, once, thrice = (noisy["mission"][name] for name in names)
+    assert latent["accuracy"] >= max(0.97, once["accuracy"] + 0.02, thrice["accuracy"] - 0.01)
+    assert latent["mean_time_s"] <= 0.9 * thrice["mean_time_s"]
+    assert latent["observations_per_poi"] <= 0.65 * thrice["observations_per_poi"]
+    assert latent["ended"].get("time limit", 0) <= 2
 
 
 def test_many_preset(tmp_path, summary_of):
@@ -181,20 +179,6 @@ def test_many_preset(tmp_path, summary_of):
     assert "time limit" not in latent["ended"]
     calibration = latent["calibration"]
     assert abs(calibration["confidence"] - calibration["accuracy"]) <= 0.02
-
-
-def test_a_team_with_noisy_sensors(tmp_path, summary_of):
-    names = "latent", "naive", "naive_3"
-    policies = "--mission.policies", *names, "--mission.episodes", "64"
-    found = summary_of("noisy", 0, tmp_path / "team", "--dqn.task", "team", *policies)["mission"]
-    latent, once, thrice = (found[name] for name in names)
-    assert latent["accuracy"] >= once["accuracy"] + 0.02
-    # Exploration comes near this accuracy with three looks by each sensor.
-    assert latent["accuracy"] >= thrice["accuracy"] - 0.01
-    assert latent["mean_time_s"] <= 0.9 * thrice["mean_time_s"]
-    assert latent["observations_per_poi"] <= 0.65 * thrice["observations_per_poi"]
-    # With one robot of each modality and the map policies, one in a hundred missions is late.
-    assert latent["ended"].get("time limit", 0) <= 2
 
 
 def test_team_preset(tmp_path, summary_of, run_program):

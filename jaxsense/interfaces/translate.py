@@ -18,7 +18,7 @@ from jax.extend import core
 from jax.interpreters import partial_eval
 from jax.lax import GatherScatterMode, RoundingMethod
 from jaxtyping import PyTree
-from onnx import helper, numpy_helper
+from onnx import checker, helper, numpy_helper
 from onnx.shape_inference import InferenceError
 from spox import Tensor, Var, argument, build
 
@@ -386,6 +386,7 @@ def program(
     for each in [x for x in model.graph.input if x.name in weights]:
         model.graph.input.remove(each)
         model.graph.initializer.append(numpy_helper.from_array(weights[each.name], each.name))
+    checker.check_model(model)
     return model.SerializeToString(), outputs
 
 

@@ -111,7 +111,7 @@ def of_run(path: Path, trust: bool = False, field: str = "run") -> Settings:
 
 def _read(file: Path, field: str, path: Path) -> Json:
     """The content of a `config.json`; raises `ConfigError` about `field = path`."""
-    form = "TOML" if file.suffix == ".toml" else "JSON"
+    form = "TOML" if file.suffix.lower() == ".toml" else "JSON"
     try:
         # A file that the user names may be a link, that of a run may not lead out of it.
         real = Path(os.path.realpath(file)) if path == file else file
@@ -130,7 +130,7 @@ def _read(file: Path, field: str, path: Path) -> Json:
 def _settings_of(content: Json, trust: bool) -> Settings:
     """The settings in a `config.json`; raises `ConfigError` if one is unknown or wrong."""
     if unknown := sorted(set(content) - _KNOWN):
-        reason = "unknown field of a run's config.json, which holds settings in config"
+        reason = "unknown field of a config.json or preset, which hold settings in config"
         raise ConfigError(unknown[0], content[unknown[0]], reason)
     require_known("preset", preset := content.get("preset", "default"), PRESETS)
     config = from_plain(content.get("config", {}), PRESETS[str(preset)])

@@ -114,8 +114,8 @@ def _environment(
     novelty: Novelty,
 ) -> Environment:
     """What an agent learns in."""
-    bank = detections.by_distance if config.dqn.task == "team" else Bank(detections.bank)
-    looks = Live(make_world(config), detectors) if config.dqn.observe == "live" else bank
+    is_live, bank = config.dqn.observe == "live", detections.by_distance or Bank(detections.bank)
+    looks = Live(make_world(config), detectors) if is_live else bank
     models = dataclasses.replace(models_of(config, fusion), novelty=novelty)
     mdp = make_mdp(config, models, looks)
     return Environment(make_agent(config), mdp.of(modality) if mdp.teams is None else mdp)

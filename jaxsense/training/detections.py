@@ -171,13 +171,13 @@ class Detections:
       bank: for each modality `[C, S, D_m]` features for training.
       held_out: for each modality `[C, S', D_m]` features of other scenes, to measure on.
       windows: for each modality `[C, 1, F]` one held-out look at each class.
-      by_distance: the bank for robots that travel.
+      by_distance: the bank for robots that travel, if they do.
     """
 
     bank: Samples
     held_out: Samples
     windows: tuple[Float[Array, "C 1 F"], ...]
-    by_distance: looks.Bank
+    by_distance: looks.Bank | None
 
 
 def looks_at_nothing(key: Key, config: Config, *, surveys: Surveys) -> tuple[Looks, ...]:
@@ -295,7 +295,7 @@ def detect(
     found = [by_class(x, classes, config.jmvae.samples_per_class) for x in given]
     return Detections(
         bank=found[0],
-        by_distance=looks.by_distance(*found),
+        by_distance=looks.by_distance(*found) if config.dqn.task == "team" else None,
         held_out=by_class(features(held_out), held_out.classes, held_out_per_class(config)),
         windows=by_class(held_out.windows, held_out.classes, 1),
     )

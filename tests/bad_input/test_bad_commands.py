@@ -88,7 +88,7 @@ TRAIN = [
     (["--config", "field.toml"], "dqn.epoch = 3: unknown setting; did you mean dqn.epochs?"),
     (["--config", "preset.json"], "preset = 'x': must be one of default, paper"),
     (["--config", "smoke.json", "--preset", "paper"], "has a preset; omit --preset"),
-    (["--config", "unknown.json"], "colour = 3: unknown field of a run's config.json"),
+    (["--config", "unknown.json"], "colour = 3: unknown field of a config.json"),
     (["--config", "sensor.json"], "sensors.x = {'make': 'a:b'}: missing setting attribute"),
     (["--resume", "full"], "resume = 'full': is not a run directory: it has no config.json"),
     (["--dqn.epochs", "1e3"], "dqn.epochs = '1e3': must be a whole number"),

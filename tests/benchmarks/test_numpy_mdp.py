@@ -46,29 +46,3 @@ def test_every_step_equals_ours(task, modality):
             np.testing.assert_allclose(reward, outcome.reward, atol=TOLERANCE)
             assert (terminated, truncated) == (bool(outcome.terminated), bool(outcome.truncated))
             np.testing.assert_array_equal(their_state.seen, state.seen)
-
-
-def test_episodes_are_cut_as_ours(task):
-    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
-    rng = np.random.default_rng(0)
-    state = theirs.reset(rng)
-    cuts = [theirs.step(rng, state, 0)[2] for _ in range(task.config.mdp.max_steps)]
-    assert cuts == [False] * (task.config.mdp.max_steps - 1) + [True]
-
-
-@pytest.mark.parametrize("first", [0, 1])
-def test_starts_write_looks_in_rotated_order(task, first):
-    """A PoI that both have seen: the second writes over the first, as `update` does."""
-    mdp = task.mdp
-    theirs = NumpyMdp(task.config, task.models.jmvae, task.bank, 0)
-    classes = np.array([0, 1, 2])
-    state = theirs.reset(
-        np.random.default_rng(0), classes, np.ones((3, 2), bool), np.full(3, first)
-    )
-    for poi, poi_class in enumerate(classes):
-        belief, seen = mdp.fusion.prior, jnp.zeros(2, bool)
-        for modality in (first, 1 - first):
-            belief = mdp.fusion.update(belief, seen, task.bank[modality][poi_class, 0], modality)
-            seen = seen.at[modality].set(True)
-        np.testing.assert_allclose(state.mean[poi], belief.mean, atol=TOLERANCE)
-        np.testing.assert_allclose(state.std[poi], belief.std, atol=TOLERANCE)

@@ -169,6 +169,13 @@ def models_of(config):
     return jax.tree.map(moved, untrained(config))
 
 
+def constants_of(graph):
+    """Weights and constants, also of loops."""
+    yield from graph.initializer
+    for attribute in (each for node in graph.node for each in node.attribute):
+        yield from [attribute.t] if attribute.HasField("t") else constants_of(attribute.g)
+
+
 @pytest.mark.slow  # compiles every program of each
 @pytest.mark.parametrize("case", CASES)
 def test_an_archive_answers_as_ours_does(case):
@@ -180,7 +187,7 @@ def test_an_archive_answers_as_ours_does(case):
     # Not every runtime reduces empty arrays; lists of axes, int64, may be empty.
     with zipfile.ZipFile(io.BytesIO(archive)) as files:
         graphs = [onnx.load_from_string(files.read(f"{name}.onnx")).graph for name in programs]
-    constants = [each for graph in graphs for each in graph.initializer]
+    constants = [each for graph in graphs for each in constants_of(graph)]
     assert all(0 not in x.dims for x in constants if x.data_type != onnx.TensorProto.INT64)
     ours, rng = export.functions(config), np.random.default_rng(0)
     assert {*programs} == {*ours} == {*contents["programs"]}

@@ -33,6 +33,8 @@ def seen_by(own, other=(0, 0, 0)):
         ([1.0, 0.99, 1.01, 0.0], 2),  # the farthest, if the network says so
         ([-0.2, 0.3, 0.1, 0.2], 1),
         ([0.1, 0.2, 0.3, 0.31], 3),  # nothing beats NOP
+        ([0.5, 0.5, 0.5001, 0.5], 2),
+        *((x := np.random.default_rng(seed).normal(size=4), x.argmax()) for seed in range(8)),
     ],
 )
 def test_the_network_alone_chooses(chosen, set_robot, values, target):

@@ -12,6 +12,7 @@ from tiny import KEY, SMOKE, TINY, given_problem, stage_of
 from jaxsense import looks, training
 from jaxsense.config import DetectorConfig, JmvaeConfig
 from jaxsense.core import supervised
+from jaxsense.training import detections
 from jaxsense.training.detections import Survey, Surveys, num_scenes
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Looks
@@ -52,6 +53,27 @@ MEASURED = dataclasses.replace(
 
 def used(arrays):
     return set(np.concatenate([np.ravel(x) for x in jax.tree.leaves(arrays)]).tolist())
+
+
+def test_robots_that_travel_learn_from_looks_by_distance(monkeypatch):
+    rng, number = np.random.default_rng(0), 60
+    classes = jnp.asarray(rng.integers(0, 3, (number, 3)), jnp.int32)
+    far = jnp.asarray(rng.uniform(1, 2, (number, 2, 3)), jnp.float32)
+    survey = Survey(classes, (jnp.zeros((number, 3, 1)),) * 2, far)
+
+    def told(trained, windows, distances):
+        return tuple((distances[:, m] + 10 * m + 100 * classes)[..., None] for m in range(2))
+
+    monkeypatch.setattr(looks, "features", told)
+    team = dataclasses.replace(MEASURED, dqn=dataclasses.replace(MEASURED.dqn, task="team"))
+    detect = functools.partial(detections.detect, KEY, surveys=Surveys(survey, *[survey] * 3))
+    found = detect(team, trained=())
+    for m, (values, far) in enumerate(zip(*vars(found.by_distance).values(), strict=True)):
+        assert (np.diff(far) >= 0).all()
+        of_class = 10 * m + 100 * np.arange(3)[:, None]
+        np.testing.assert_allclose(values[..., 0], far + of_class, rtol=1e-5)
+        np.testing.assert_array_equal(values[..., 0], np.sort(found.bank[m][..., 0]))
+    assert detect(MEASURED, trained=()).by_distance is None
 
 
 def test_a_training_measures_on_scenes_that_it_did_not_train_on(surveys, monkeypatch):
