@@ -32,6 +32,7 @@ _ROUNDING = 1e-5
 _ROBOTS_EACH = 2  # of each modality in a random team, at most
 _MOST_CHOICES = 300  # in an episode of a team
 _AS_FAR = 16  # one in so many looks at a class counts as from about as far
+_FAR_APART = 1e3  # m, beyond all distances
 _FARTHEST_MOVE = 1.0  # m, about as far as a robot that looks again drives
 
 
@@ -102,7 +103,10 @@ class Bank:
         row = draw % number
         if self.distances is not None:
             near = -(-number // _AS_FAR)
-            rank = jnp.searchsorted(self.distances[modality][which], distance)
+            far = self.distances[modality]
+            # One search through all classes: in a batch, each of a class would copy its distances.
+            order = (far + _FAR_APART * jnp.arange(len(far))[:, None]).ravel()
+            rank = jnp.searchsorted(order, distance + _FAR_APART * which) - which * number
             first = jnp.clip(rank - near // 2, 0, number - near)
             row = jnp.where(jnp.asarray(distance) > 0, first + draw % near, row)
         return samples[which, row], scene
