@@ -56,7 +56,7 @@ def test_bank_draws_every_detection_of_the_true_class_and_no_other(modality):
 
 
 def test_a_bank_by_distance_draws_looks_from_about_as_far():
-    far = jax.random.permutation(jax.random.key(0), jnp.arange(1.0, 33.0)) + jnp.zeros((3, 1))
+    far = jnp.tile(jax.random.permutation(jax.random.key(0), jnp.arange(1.0, 33.0)), (3, 1))
     bank, classes = looks.by_distance((jnp.stack([far, 0 * far], -1),), (far,)), jnp.array([1])
     draw = lambda key, far: bank.observe(key, classes, jnp.int32(0), 0, far)[0][0]  # noqa: E731
     look = jax.jit(jax.vmap(draw, (0, None)))
