@@ -36,11 +36,8 @@ def test_every_step_equals_ours(task, modality):
         state = reset(jax.random.key(episode), classes, seen)
         their_state = theirs.reset(rng, classes, seen.copy())
         for action in [*rng.integers(3, size=7), 3]:
-            np.testing.assert_allclose(
-                theirs.observation(their_state),
-                observed(state.belief),
-                atol=TOLERANCE,
-            )
+            seen_by_them = theirs.observation(their_state)
+            np.testing.assert_allclose(seen_by_them, observed(state.belief), atol=TOLERANCE)
             state, outcome = step(jax.random.key(1), state, jnp.int32(action))
             reward, terminated, truncated = theirs.step(rng, their_state, int(action))
             np.testing.assert_allclose(reward, outcome.reward, atol=TOLERANCE)
