@@ -111,7 +111,11 @@ def compare(
     states, records = played(key, config, models, policy, episodes)
     sizes = [len(config.labels(m)) for m in config.modalities]
     bank = Bank(tuple(jnp.zeros((len(config.arena.classes), 1, size)) for size in sizes))
-    mdp = dataclasses.replace(make_mdp(config, models, bank), num_pois=config.arena.num_pois)
+    mdp = make_mdp(config, models, bank)
+    assert mdp.teams is not None
+    # The looks are given: nobody chooses anew.
+    teams = dataclasses.replace(mdp.teams, chooses_anew=False)
+    mdp = dataclasses.replace(mdp, num_pois=config.arena.num_pois, teams=teams)
     of_mission = lambda i: jax.tree.map(lambda x: x[i], (records, states.scene.layout.position))  # noqa: E731
     of_each = [looks(*of_mission(i)) for i in range(episodes)]
     sequences, times = (np.stack(x) for x in zip(*of_each, strict=True))

@@ -92,7 +92,7 @@ def observation(belief: Belief) -> Float[Array, " S"]:
 
 @pytree
 class Underway:
-    """A state, with each robot's observation and choice when it last set out."""
+    """A state, with each robot's observation at its last choice, and this."""
 
     now: State
     observation: Float[Array, "R S"]
@@ -136,7 +136,7 @@ class Environment:
           action: the choice.
 
         Returns:
-          The next state; the transition of the robot that has just looked, from when it set out, or
+          The next state; the transition of the robot that has just looked, from its last choice, or
           else of NOP, after which nothing is earned; and the outcome.
         """
         seen = state.observation.at[state.now.agent].set(s_tm1)
@@ -144,11 +144,12 @@ class Environment:
         now, outcome = mdps.step(key, self.mdp, state.now, action)
         # The values of those who travel are discounted already.
         discount = self.agent.discount if self.agent.travel is None else 1.0
+        looked = outcome.poi < self.mdp.num_pois
         transition = Transition(
             s_tm1=seen[now.agent],
-            a_tm1=chosen[now.agent],
+            a_tm1=jnp.where(looked, chosen[now.agent], self.mdp.num_pois),
             r_t=outcome.reward,
-            discount_t=jnp.where(outcome.poi < self.mdp.num_pois, discount, 0.0),
+            discount_t=jnp.where(looked, discount, 0.0),
             s_t=self._observe(now),
         )
         return Underway(now, seen, chosen), transition, outcome

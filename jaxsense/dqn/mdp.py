@@ -6,8 +6,9 @@ is no operation (NOP), after which the robot is done. The episode ends with the 
 
 Without `teams`, one robot looks in every step: the paper's MDP. With them, robots take turns. In
 each step one robot chooses; if all have chosen, time passes until a robot arrives and looks, which
-chooses next. For each robot this is a semi-Markov decision process (Sutton, Precup and Singh 1999,
-Artificial Intelligence 112, Sec. 3): an action takes the time until its look.
+chooses next; then, as in missions, those that are on their way choose anew. For each robot this is
+a semi-Markov decision process (Sutton, Precup and Singh 1999, Artificial Intelligence 112, Sec. 3):
+an action takes the time until its look.
 """
 
 import dataclasses
@@ -161,6 +162,11 @@ class Mdp:
         return to_go(self.novelty, self.travel, state.team, apart)
 
     @property
+    def chooses_anew(self) -> bool:
+        """Whether robots on their way choose anew after a look by another."""
+        return self.teams is not None and self.teams.chooses_anew
+
+    @property
     def novelty(self) -> Novelty | None:
         """How new looks are; None where all are."""
         return None if self.teams is None else self.teams.novelty
@@ -267,7 +273,10 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     distance = jnp.linalg.norm(place - team.positions[jnp.minimum(poi, nop - 1)])
     changed, reward = _look(key, mdp, state, poi, looker, place, distance)
 
-    following = jnp.argmin(jnp.where(asks, (robots - state.agent - 1) % len(robots), len(robots)))
+    ask_anew = is_looker | (mdp.chooses_anew & works & (looked <= 0))
+    asks = jnp.where(passes, ask_anew, asks)
+    before = jnp.where(passes, looker - 1, state.agent)
+    following = jnp.argmin(jnp.where(asks, (robots - before - 1) % len(robots), len(robots)))
     after = dataclasses.replace(
         state,
         **changed,
@@ -278,8 +287,8 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
             works=works,
             target=jnp.where(passes & is_looker, nop, target),
         ),
-        asks=jnp.where(passes, is_looker, asks),
-        agent=jnp.where(passes, looker, following.astype(jnp.int32)),
+        asks=asks,
+        agent=following.astype(jnp.int32),
         looked=jnp.where(passes, looked, state.looked),
         seconds=state.seconds + seconds,
     )

@@ -296,6 +296,7 @@ class Teams:
       novelty: how new looks are after others from nearby; all are by default.
       is_random: whether in each episode only some of the robots work, at least one of each
         modality; then as many of each stand side by side.
+      chooses_anew: see `Mdp.chooses_anew`.
     """
 
     config: TeamConfig
@@ -306,6 +307,7 @@ class Teams:
     partly_seen: jax.Array | float = 0.5
     novelty: Novelty | None = None
     is_random: bool = struct.field(pytree_node=False, default=True)
+    chooses_anew: bool = struct.field(pytree_node=False, default=True)
 
     def draw(
         self, keys: Sequence[Key], num_pois: int, robots: Int[Array, " R"]

@@ -172,7 +172,7 @@ def task_of(
     else:
         # A task is a whole mission.
         fixed = {"travel": _TRAVEL, "partly_seen": 0.0, "is_random": False}
-        teams = dataclasses.replace(mdp.teams, **fixed)
+        teams = dataclasses.replace(mdp.teams, **fixed, chooses_anew=False)
         mdp = dataclasses.replace(mdp, robots=jnp.array(config.modality_of_robot), teams=teams)
     return Task(mdp, parts, scaling, returns, name, agent, config.modalities)
 

@@ -22,7 +22,7 @@ FIRST = 0.2 - 1 / np.sqrt(40)  # gain of a look, see `toys.classes_mdp`
 def make_mdp(mapped=None, places=PLACES, robots=(0, 1), **config):
     mapped = classes_mdp(partly_seen_starts=False) if mapped is None else mapped
     poses = jnp.arange(3.0 * len(robots)).reshape(-1, 3)
-    given = {"num_pois": (1, 3), "robots": jnp.array(robots), **config}
+    given = {"num_pois": (1, 3), "robots": jnp.array(robots), "chooses_anew": False, **config}
     return team_mdp_of(mapped, Fixed(places, poses), **given)
 
 
@@ -58,11 +58,11 @@ def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
 jitted = jax.jit(lambda key, state, action: mdps.step(key, MDP, state, action))
 
 
-def play(state, *actions):
+def play(state, *actions, step=jitted):
     """The states after each action, and the outcomes."""
     states, outcomes = [], []
     for action in actions:
-        state, outcome = jitted(jax.random.key(1), state, jnp.int32(action))
+        state, outcome = step(jax.random.key(1), state, jnp.int32(action))
         states.append(state)
         outcomes.append(outcome)
     return states, outcomes
@@ -170,6 +170,27 @@ def test_a_look_that_has_begun_goes_on_while_others_look():
     # (2.06 - .08 - .9) / .2 = 5.4 s and 1 s of looking.
     np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0.4], atol=1e-4)
     assert [int(s.agent) for s in states] == [1, 0, 1]
+
+
+def test_robots_on_their_way_choose_anew_after_a_look_and_those_that_look_do_not():
+    mdp = make_mdp(chooses_anew=True)
+    step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
+    begun = start([[0, 0, 0], [0, 0, math.pi / 2]], [CAMERA, LIDAR])
+    # Robot 0 looks after 6 s; robot 1, which has driven 1.2 m, may go on, for 5 s, or turn round.
+    (*_, goes_on), outcomes = play(begun, 0, 1, NOP, 1, step=step)
+    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0, 5], atol=1e-5)
+    assert goes_on.seen[1, LIDAR]
+    states, outcomes = play(begun, 0, 1, NOP, 0, NOP, step=step)
+    assert [int(s.agent) for s in states[:4]] == [1, 0, 1, 1]
+    assert states[3].seen[0, LIDAR]
+    assert outcomes[4].terminated
+    # At 6 s robot 1 is looking: robot 0 alone chooses, and is asked again after that look.
+    poses = [[0, 0, 0], [0, 0.08, math.pi / 2]]
+    places = jnp.array([[1.9, 0.0], [0.0, 2.06], [-3.9, 0.0]])
+    begun = start(poses, [CAMERA, LIDAR], places=places)
+    states, outcomes = play(begun, 0, 1, 2, NOP, step=step)
+    np.testing.assert_allclose([o.seconds for o in outcomes[:3]], [0, 6, 0.4], atol=1e-4)
+    assert [int(s.agent) for s in states] == [1, 0, 1, 0]
 
 
 def test_first_choices_go_round_the_robots_that_work():

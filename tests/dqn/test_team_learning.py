@@ -66,8 +66,9 @@ def steps():
     place = learning_in(TWO)
     observe, step = jax.jit(place.observe), jax.jit(place.step)
     state, found = jax.jit(place.reset)(jax.random.key(0)), []
-    # Robot 0 to PoI 0, 6 s away; robot 1 to PoI 1, 11 s; robot 0 ends; robot 1 looks, and ends.
-    for action in (0, 1, 3, 3):
+    # Robot 0 to PoI 0, 6 s away; robot 1 to PoI 1, 11 s; robot 0 ends; robot 1 chooses anew what it
+    # has chosen, looks, and ends.
+    for action in (0, 1, 3, 1, 3):
         seen = observe(state)
         agent = int(state.now.agent)
         state, transition, outcome = step(jax.random.key(1), state, seen, jnp.int32(action))
@@ -75,24 +76,24 @@ def steps():
     return found
 
 
-def test_a_look_is_learned_from_when_its_robot_set_out(steps):
+def test_a_look_is_learned_from_its_robots_last_choice(steps):
     agents, seen, transitions, outcomes, after = zip(*steps, strict=True)
-    assert agents == (0, 1, 0, 1)
-    # No look, that of robot 0 at PoI 0, that of robot 1 at PoI 1, and none.
-    assert [int(t.a_tm1) for t in transitions] == [3, 0, 1, 3]
-    assert [float(t.discount_t) for t in transitions] == [0, 1, 1, 0]
+    assert agents == (0, 1, 0, 1, 1)
+    # No look, that of robot 0 at PoI 0, none, that of robot 1 at PoI 1, and none.
+    assert [int(t.a_tm1) for t in transitions] == [3, 0, 3, 1, 3]
+    assert [float(t.discount_t) for t in transitions] == [0, 1, 0, 1, 0]
     gain = 0.2 - 1 / np.sqrt(40)
-    np.testing.assert_allclose([t.r_t for t in transitions], [0, gain, gain, 0], atol=1e-6)
-    assert [bool(o.terminated) for o in outcomes] == [False, False, False, True]
+    np.testing.assert_allclose([t.r_t for t in transitions], [0, gain, 0, gain, 0], atol=1e-6)
+    assert [bool(o.terminated) for o in outcomes] == [False, False, False, False, True]
     np.testing.assert_array_equal(transitions[1].s_tm1, seen[0])
-    np.testing.assert_array_equal(transitions[2].s_tm1, seen[1])
-    assert not np.array_equal(seen[0], seen[1])
-    for transition, observed in zip(transitions[1:3], after[1:3], strict=True):
-        np.testing.assert_array_equal(transition.s_t, observed)
+    np.testing.assert_array_equal(transitions[3].s_tm1, seen[3])
+    assert not np.array_equal(seen[1], seen[3])
+    for i in (1, 3):
+        np.testing.assert_array_equal(transitions[i].s_t, after[i])
 
 
 def test_without_a_look_nothing_is_lost(steps):
-    for _, _, t, _, _ in (steps[0], steps[3]):
+    for _, _, t, _, _ in (steps[0], steps[2], steps[4]):
         # The network knows that nothing follows NOP.
         q_tm1, q_t = jnp.array([1.0, 2.0, 3.0, 0.0]), jnp.full(4, 9.0)
         found = t.a_tm1, t.r_t, t.discount_t, q_t
