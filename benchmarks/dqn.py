@@ -172,7 +172,7 @@ def dqn_seeds(options: Options) -> Row:
 
 def _settings(options: Options, epochs: int = 400) -> DqnConfig:
     """512 environments, one gradient step of batch 512 for each step of all of them."""
-    settings = DqnConfig(observe="bank", num_envs=512, epochs=epochs, updates=1)
+    settings = DqnConfig(task="map", num_envs=512, epochs=epochs, updates=1)
     settings = dataclasses.replace(settings, batch=512, replay_capacity=131072)
     if options.quick:
         few = {"num_envs": 16, "batch": 16, "replay_capacity": 1024}
