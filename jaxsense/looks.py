@@ -272,9 +272,13 @@ def features(
     distances: Float[Array, "S M N"],
 ) -> tuple[Float[Array, "S N D_m"], ...]:
     """Features of surveyed scenes, for each modality."""
-    of_looks = jax.vmap(jax.vmap(detectors.features, (None, 0, 0)), (None, 0, 0))
-    each = zip(trained, windows, jnp.swapaxes(distances, 0, 1), strict=True)
-    return tuple(of_looks(*given) for given in each)
+
+    def of_scene(windows: tuple[jax.Array, ...], distances: jax.Array) -> tuple[jax.Array, ...]:
+        of_looks = jax.vmap(detectors.features, (None, 0, 0))
+        return tuple(map(of_looks, trained, windows, distances))
+
+    batch = min(_SCENES_AT_ONCE, len(distances))
+    return jax.lax.map(lambda scene: of_scene(*scene), (windows, distances), batch_size=batch)
 
 
 def balanced_classes(key: Key, config: Config, number: int) -> Int[Array, "{number} N"]:

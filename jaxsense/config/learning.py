@@ -251,7 +251,7 @@ class EvaluationConfig(Section, place="evaluation"):
     """
 
     num_starts: int = limited(512, at_least=1)
-    num_repeats: Traced[int] = limited(96, at_least=1)
+    num_repeats: Traced[int] = limited(48, at_least=1)
     num_histories: int = limited(8190, at_least=1, at_most=10_000_000)
     num_pois: tuple[int, ...] = limited((), at_least=1, at_most=64)
     num_states: int = limited(4096, at_least=1, at_most=100_000)

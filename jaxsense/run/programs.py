@@ -27,9 +27,6 @@ OwnPolicies = Mapping[str, Values]
 
 _BEFORE_MISSIONS = 2  # stages that all others wait for
 _HAS_ROWS = ("survey",)  # whose inputs and outputs are independent rows, which workers share
-# The newer code generator of a CPU trains a JMVAE a tenth faster, other networks a twentieth at
-# most, and takes half as long again and four times the memory to compile.
-_RUNS_LONG = ("jmvae",)
 
 
 class StagePrograms(NamedTuple):
@@ -141,8 +138,7 @@ class Programs:
             def chunk(key: Key, config: Config, state: Output, inputs: dict[str, Output]) -> Output:
                 return step(key, config, state, **inputs)
 
-            runs_long = _on_cpu() and name in _RUNS_LONG
-            _, progress = advance.compile(chunk, key, config, state, inputs, runs_long=runs_long)
+            _, progress = advance.compile(chunk, key, config, state, inputs)
             output = finish.compile(last, config, state, inputs)
             metrics = tuple(progress.metrics)
         self._of[name].set_result(StagePrograms(begin, advance, finish, output, metrics))
