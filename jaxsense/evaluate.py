@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from jaxsense import mission
+from jaxsense import looks, mission
 from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Positional
@@ -176,13 +176,15 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
         cli.warn(PROGRAM, f"{arena.num_pois} PoIs: the Q-network learned with {least} to {most}")
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):
-        reason = f"must be {config.arena.num_pois}, as in training; only a run with "
-        reason += "dqn.task = team plays with other numbers"
+        reason = f"must be {config.arena.num_pois}, as in training; others need dqn.task = team"
         raise ConfigError("arena.num_pois", arena.num_pois, reason)
     robots, given = config.robots, arguments.robots
     if given is not None and sorted(given) != sorted(config.carried):
         # In one order, so that a team plays in the same arenas however it is named.
         robots = tuple(sorted(given, key=[*config.modalities, *given].index))
+        each, most = max(map(robots.count, robots)), looks.ROBOTS_EACH
+        if config.dqn.task == "team" and each > most:
+            cli.warn(PROGRAM, f"{each} robots of a sensor: the Q-network learned with {most}")
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
     is_partly_seen = config.mdp.partly_seen_starts and arena == config.arena
     mdp = dataclasses.replace(config.mdp, partly_seen_starts=is_partly_seen)

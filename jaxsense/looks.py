@@ -27,9 +27,10 @@ from jaxsense.sim.world import Scene, World
 from jaxsense.vae import detectors
 from jaxsense.vae.detectors import Detector
 
+ROBOTS_EACH = 2
+"""Robots of each modality in a random team, at most."""
 _SCENES_AT_ONCE = 512
 _ROUNDING = 1e-5
-_ROBOTS_EACH = 2  # of each modality in a random team, at most
 _MOST_CHOICES = 300  # in an episode of a team
 _AS_FAR = 16  # one in so many looks at a class counts as from about as far
 _FAR_APART = 1e3  # m, beyond all distances
@@ -156,7 +157,7 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
         mdp,
         config=dataclasses.replace(config.mdp, max_steps=_MOST_CHOICES),
         num_pois=settings.num_pois[1],
-        robots=jnp.repeat(jnp.arange(len(config.modalities)), _ROBOTS_EACH),
+        robots=jnp.repeat(jnp.arange(len(config.modalities)), ROBOTS_EACH),
         teams=Teams(
             settings,
             make_travel(config),
@@ -272,13 +273,9 @@ def features(
     distances: Float[Array, "S M N"],
 ) -> tuple[Float[Array, "S N D_m"], ...]:
     """Features of surveyed scenes, for each modality."""
-
-    def of_scene(windows: tuple[jax.Array, ...], distances: jax.Array) -> tuple[jax.Array, ...]:
-        of_looks = jax.vmap(detectors.features, (None, 0, 0))
-        return tuple(map(of_looks, trained, windows, distances))
-
-    batch = min(_SCENES_AT_ONCE, len(distances))
-    return jax.lax.map(lambda scene: of_scene(*scene), (windows, distances), batch_size=batch)
+    of_looks = jax.vmap(detectors.features, (None, 0, 0))
+    scenes, batch = (windows, distances), min(_SCENES_AT_ONCE, len(distances))
+    return jax.lax.map(lambda seen: tuple(map(of_looks, trained, *seen)), scenes, batch_size=batch)
 
 
 def balanced_classes(key: Key, config: Config, number: int) -> Int[Array, "{number} N"]:

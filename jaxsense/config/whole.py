@@ -133,6 +133,9 @@ class Config(Section):
             groups = -(-number * num_classes // in_group)
             expected = f"leaves some of {num_classes} classes without a look; raise it"
             require(groups * self.arena.num_pois >= num_classes, section, field, expected)
+        most, is_nats = math.log(num_classes), self.mdp.reward == "nats"
+        expected = f"must be below {most:.3g}, all the nats that looks can tell: none would pay"
+        require(not is_nats or self.mdp.look_cost < most, self.mdp, "look_cost", expected)
         adds_up = jmvae.fusion == "filter" or not self.mission.communication.own_maps
         expected = "must be off unless jmvae.fusion is 'filter', which accumulates looks"
         require(adds_up, self.mission.communication, "own_maps", expected)

@@ -162,11 +162,6 @@ class Mdp:
         return to_go(self.novelty, self.travel, state.team, apart)
 
     @property
-    def chooses_anew(self) -> bool:
-        """Whether robots on their way choose anew after a look by another."""
-        return self.teams is not None and self.teams.chooses_anew
-
-    @property
     def novelty(self) -> Novelty | None:
         """How new looks are; None where all are."""
         return None if self.teams is None else self.teams.novelty
@@ -273,8 +268,8 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     distance = jnp.linalg.norm(place - team.positions[jnp.minimum(poi, nop - 1)])
     changed, reward = _look(key, mdp, state, poi, looker, place, distance)
 
-    ask_anew = is_looker | (mdp.chooses_anew & works & (looked <= 0))
-    asks = jnp.where(passes, ask_anew, asks)
+    is_on_way = works & (looked <= 0) & (mdp.teams is not None and mdp.teams.chooses_anew)
+    asks = jnp.where(passes, is_looker | is_on_way, asks)
     before = jnp.where(passes, looker - 1, state.agent)
     following = jnp.argmin(jnp.where(asks, (robots - before - 1) % len(robots), len(robots)))
     after = dataclasses.replace(

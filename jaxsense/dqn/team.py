@@ -296,7 +296,7 @@ class Teams:
       novelty: how new looks are after others from nearby; all are by default.
       is_random: whether in each episode only some of the robots work, at least one of each
         modality; then as many of each stand side by side.
-      chooses_anew: see `Mdp.chooses_anew`.
+      chooses_anew: whether robots on their way choose anew after a look by another.
     """
 
     config: TeamConfig

@@ -139,8 +139,7 @@ OTHERS = [
     (
         evaluate,
         ["RUN", "--arena.num-pois", "4"],
-        "arena.num_pois = 4: must be 3, as in training; only a run with dqn.task = team plays with "
-        "other numbers",
+        "arena.num_pois = 4: must be 3, as in training; others need dqn.task = team",
     ),
     (
         evaluate,

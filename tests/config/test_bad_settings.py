@@ -165,6 +165,7 @@ CHANGES = [
     ({"viewpoint.min_distance": 1.2}, "max_distance = 1.2: must be above min_distance = 1.2"),
     ({"viewpoint.max_distance": 1.6}, "must be at most half the arena's side, 1.5 m"),
     ({"navigation.view_range": 1.3}, "= 1.3: must be at most viewpoint.max_distance = 1.2 m"),
+    ({"mdp.reward": "nats", "mdp.look_cost": 1.1}, "look_cost = 1.1: must be below 1.1, all the"),
     ({"navigation.view_range": 0.29}, "navigation.view_range = 0.29: must be at least 0.300 m"),
     (
         {"mdp.partly_seen_starts": True, "arena.num_pois": 16, "arena.side": 6.0},
@@ -241,9 +242,8 @@ AT_LIMITS = [
     {"arena.shapes": {"cube": SHAPES["cube"]}, "arena.classes": ("red cube", "green cube")},
     {"jmvae.latent_size": 4, "arena.shapes": POSTS, "arena.classes": SIXTEEN},
     {"mission.localisation": LocalisationConfig(search=(0.3, 30.0), error=(1.0, 180.0))},
-    {"dqn.epochs": 100, "dqn.replay_capacity": 32},
-    {"dqn.epochs": 970},  # in chunks of 10
-    {"team.num_pois": (3, 3), "team.sides": (4.0, 4.0)},
+    {"dqn.epochs": 970, "dqn.replay_capacity": 32},  # in chunks of 10
+    {"team.num_pois": (3, 3), "team.sides": (4.0, 4.0), "mdp.reward": "nats", "mdp.look_cost": 1.0},
     FROM_SCANS | {"lidar.num_beams": 77, "lidar.window": 20},
     FROM_SCANS | {"lidar.window": 512},
     FROM_SCANS | {"lidar.window": 3, "lidar.window_range": 1.2},

@@ -26,18 +26,17 @@ def make_mdp(mapped=None, places=PLACES, robots=(0, 1), **config):
     return team_mdp_of(mapped, Fixed(places, poses), **given)
 
 
-MDP = make_mdp()
+MDP, ANEW = make_mdp(), make_mdp(chooses_anew=True)
 
 
 reset = jax.jit(starts.reset)
 
 
-def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
+def start(poses, modality, places=PLACES, works=None):
     """Nobody has chosen yet."""
     number = len(poses)
     works = np.ones(number, bool) if works is None else np.array(works)
-    seen = np.zeros((3, 2), bool) if seen is None else np.array(seen, bool)
-    known = reset(jax.random.key(0), mdp, np.array([0, 1, 2]), seen)
+    known = reset(jax.random.key(0), MDP, np.arange(3), np.zeros((3, 2), bool))
     team = Team(
         positions=places,
         present=jnp.ones(3, bool),
@@ -55,22 +54,20 @@ def start(poses, modality, mdp=MDP, seen=None, places=PLACES, works=None):
     )
 
 
-jitted = jax.jit(lambda key, state, action: mdps.step(key, MDP, state, action))
+jitted = jax.jit(mdps.step)
 
 
-def play(state, *actions, step=jitted):
+def play(state, *actions, mdp=MDP):
     """The states after each action, and the outcomes."""
     states, outcomes = [], []
     for action in actions:
-        state, outcome = step(jax.random.key(1), state, jnp.int32(action))
+        state, outcome = jitted(jax.random.key(1), mdp, state, jnp.int32(action))
         states.append(state)
         outcomes.append(outcome)
     return states, outcomes
 
 
-@jax.jit
-def reset_all(keys, mdp):
-    return jax.vmap(lambda key: starts.reset(key, mdp))(keys)
+reset_all = jax.jit(jax.vmap(starts.reset, (0, None)))
 
 
 def resets(**given):
@@ -162,35 +159,27 @@ def test_robots_look_side_by_side():
     assert [int(s.agent) for s in states] == [1, 2, 0, 1, 2, 0]
 
 
-def test_a_look_that_has_begun_goes_on_while_others_look():
-    # Robot 1 is in place after 5.4 s and robot 0 looks at 6 s: .4 s are left.
-    poses = [[0, 0, 0], [0, 0.08, math.pi / 2]]
-    places = jnp.array([[1.9, 0.0], [0.0, 2.06], [-3.9, 0.0]])
-    states, outcomes = play(start(poses, [CAMERA, LIDAR], places=places), 0, 1, 0)
-    # (2.06 - .08 - .9) / .2 = 5.4 s and 1 s of looking.
-    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0.4], atol=1e-4)
-    assert [int(s.agent) for s in states] == [1, 0, 1]
-
-
-def test_robots_on_their_way_choose_anew_after_a_look_and_those_that_look_do_not():
-    mdp = make_mdp(chooses_anew=True)
-    step = jax.jit(lambda key, state, action: mdps.step(key, mdp, state, action))
-    begun = start([[0, 0, 0], [0, 0, math.pi / 2]], [CAMERA, LIDAR])
-    # Robot 0 looks after 6 s; robot 1, which has driven 1.2 m, may go on, for 5 s, or turn round.
-    (*_, goes_on), outcomes = play(begun, 0, 1, NOP, 1, step=step)
-    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0, 5], atol=1e-5)
-    assert goes_on.seen[1, LIDAR]
-    states, outcomes = play(begun, 0, 1, NOP, 0, NOP, step=step)
-    assert [int(s.agent) for s in states[:4]] == [1, 0, 1, 1]
-    assert states[3].seen[0, LIDAR]
-    assert outcomes[4].terminated
-    # At 6 s robot 1 is looking: robot 0 alone chooses, and is asked again after that look.
+@pytest.mark.parametrize("anew", [False, True])
+def test_a_look_that_has_begun_goes_on_while_others_look(anew):
+    # Robot 1 is in place after 5.4 s and robot 0 looks at 6 s: .4 s are left, and it is not asked.
     poses = [[0, 0, 0], [0, 0.08, math.pi / 2]]
     places = jnp.array([[1.9, 0.0], [0.0, 2.06], [-3.9, 0.0]])
     begun = start(poses, [CAMERA, LIDAR], places=places)
-    states, outcomes = play(begun, 0, 1, 2, NOP, step=step)
+    states, outcomes = play(begun, 0, 1, 0, NOP, mdp=ANEW if anew else MDP)
+    # (2.06 - .08 - .9) / .2 = 5.4 s and 1 s of looking.
     np.testing.assert_allclose([o.seconds for o in outcomes[:3]], [0, 6, 0.4], atol=1e-4)
     assert [int(s.agent) for s in states] == [1, 0, 1, 0]
+
+
+def test_robots_on_their_way_choose_anew_after_a_look():
+    begun = start([[0, 0, 0], [0, 0, math.pi / 2]], [CAMERA, LIDAR])
+    # Robot 0 looks after 6 s; robot 1, which has driven 1.2 m, may go on, for 5 s, or turn round.
+    (*_, goes_on), outcomes = play(begun, 0, 1, NOP, 1, mdp=ANEW)
+    np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0, 5], atol=1e-5)
+    assert goes_on.seen[1, LIDAR]
+    states, _ = play(begun, 0, 1, NOP, 0, mdp=ANEW)
+    assert [int(s.agent) for s in states] == [1, 0, 1, 1]
+    assert states[3].seen[0, LIDAR]
 
 
 def test_first_choices_go_round_the_robots_that_work():

@@ -162,18 +162,8 @@ def test_an_episode_goes_on_until_nop_or_the_cut(monkeypatch):
     monkeypatch.setattr(training, "_FIRST_EPSILON", 0.0)
     mdp = paying_once_mdp(num_pois=1, max_steps=3)
     # A tall bias makes the network look for ever; epsilon is 0.
-    config = DqnConfig(
-        hidden=(4,),
-        num_envs=4,
-        epochs=7,
-        updates=1,
-        batch=4,
-        replay_capacity=64,
-        learning_rate=1e-9,
-        discount=0.5,
-        epsilon_min=0.0,
-    )
-
+    few = {"hidden": (4,), "num_envs": 4, "epochs": 7, "batch": 4}
+    config = replace(SMALL, **few, learning_rate=1e-9, discount=0.5, epsilon_min=0.0)
     learning = learning_in(mdp, config)
     prepared, state = begin(jax.random.key(0), jax.random.key(2), learning, config)
     state = replace(state, params=with_bias(state.params, [1e3, -1e3]))
