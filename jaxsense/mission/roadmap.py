@@ -77,14 +77,16 @@ class Roadmap:
     @property
     def leads(self) -> Bool[Array, "N K"]:
         """From which nodes a path leads to a viewpoint of each PoI."""
-        is_last = jnp.any(jnp.isfinite(self.last()), axis=-2)
+        is_last = jnp.any(self.is_next, axis=-2)
         return jnp.any(jnp.isfinite(self.between)[None] & is_last[:, None], axis=-1)
 
     def reaches(self, position: Float[Array, "2"], leads: Bool[Array, "N K"]) -> Bool[Array, " N"]:
         """Which PoIs have a path to a viewpoint, from `leads`: cheaper than `lengths`."""
-        direct, to_node = self._first(position, self.viewpoints.reshape(-1, 2))
-        is_direct = ~jnp.isposinf(direct).reshape(self.is_free.shape) & self.is_free
-        return jnp.any(is_direct, axis=-1) | jnp.any(~jnp.isposinf(to_node)[None] & leads, axis=-1)
+        ends = jnp.concatenate([self.viewpoints.reshape(-1, 2), self.nodes])
+        is_clear = _is_clear(position[None], ends, self.centres, self.radius)[0]
+        direct, to_node = jnp.split(is_clear, [self.is_free.size])
+        is_direct = jnp.any(direct.reshape(self.is_free.shape) & self.is_free, axis=-1)
+        return is_direct | jnp.any(to_node[None] & leads, axis=-1)
 
     def last(
         self, poi: Index | slice = slice(None), view: Index | slice = slice(None)
@@ -167,8 +169,7 @@ def build(config: Config, layout: Layout) -> Roadmap:
     between = _shortest(jnp.where(is_usable[:, None] & is_usable[None], edges, jnp.inf))
     is_next = _is_clear(goals.reshape(-1, 2), nodes, centres, radius) & is_usable[None]
     is_next = is_next.reshape(*is_free.shape, -1) & is_free[..., None]
-    kept = jnp.float32(radius - _MARGIN)
-    return Roadmap(nodes, goals, between, is_next, is_free, centres, kept)
+    return Roadmap(nodes, goals, between, is_next, is_free, centres, jnp.float32(radius - _MARGIN))
 
 
 def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], Bool[Array, "N V"]]:
@@ -184,11 +185,10 @@ def _viewpoints(config: Config, layout: Layout) -> tuple[Float[Array, "N V 2"], 
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
     positions = layout.position[:, None] + offsets[None]
-    none = jnp.zeros((0, 2))
 
     def room(positions: jax.Array, poi: jax.Array) -> jax.Array:
         x, y = positions[:, 0], positions[:, 1]
-        return viewpoints.free_room(x, y, MARGIN, config.arena, layout, none, poi)
+        return viewpoints.free_room(x, y, MARGIN, config.arena, layout, jnp.zeros((0, 2)), poi)
 
     return positions, jax.vmap(room)(positions, jnp.arange(num_pois)) > 0
 
