@@ -184,7 +184,7 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
         robots = tuple(sorted(given, key=[*config.modalities, *given].index))
         each, most = max(map(robots.count, robots)), looks.ROBOTS_EACH
         if config.dqn.task == "team" and each > most:
-            cli.warn(PROGRAM, f"{each} robots of a sensor: the Q-network learned with {most}")
+            cli.warn(PROGRAM, f"{each} robots of a sensor: the Q-network learned with up to {most}")
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
     is_partly_seen = config.mdp.partly_seen_starts and arena == config.arena
     mdp = dataclasses.replace(config.mdp, partly_seen_starts=is_partly_seen)

@@ -92,7 +92,7 @@ def observation(belief: Belief) -> Float[Array, " S"]:
 
 @pytree
 class Underway:
-    """A state, with each robot's observation at its last choice, and this."""
+    """A state, and each robot's last choice with the observation before it."""
 
     now: State
     observation: Float[Array, "R S"]

@@ -59,12 +59,11 @@ jitted = jax.jit(mdps.step)
 
 def play(state, *actions, mdp=MDP):
     """The states after each action, and the outcomes."""
-    states, outcomes = [], []
+    found = []
     for action in actions:
-        state, outcome = jitted(jax.random.key(1), mdp, state, jnp.int32(action))
-        states.append(state)
-        outcomes.append(outcome)
-    return states, outcomes
+        found.append(jitted(jax.random.key(1), mdp, state, jnp.int32(action)))
+        state = found[-1][0]
+    return [*zip(*found, strict=True)]
 
 
 reset_all = jax.jit(jax.vmap(starts.reset, (0, None)))
@@ -177,6 +176,9 @@ def test_robots_on_their_way_choose_anew_after_a_look():
     (*_, goes_on), outcomes = play(begun, 0, 1, NOP, 1, mdp=ANEW)
     np.testing.assert_allclose([o.seconds for o in outcomes], [0, 6, 0, 5], atol=1e-5)
     assert goes_on.seen[1, LIDAR]
+    assert goes_on.asks.tolist() == [False, True]  # robot 0 has ended
+    last = play(begun, 2, 1, mdp=ANEW)[0][-1]  # whoever has looked chooses first
+    assert (int(last.agent), last.asks.tolist()) == (1, [True, True])
     states, _ = play(begun, 0, 1, NOP, 0, mdp=ANEW)
     assert [int(s.agent) for s in states] == [1, 0, 1, 1]
     assert states[3].seen[0, LIDAR]
@@ -207,11 +209,6 @@ def test_pois_are_anywhere_in_cells_of_their_own_and_robots_anywhere():
     assert jnp.abs(poses[..., :2]).max() < 1.9
 
 
-@jax.jit
-def alone_and_on_the_map(key, mdp, team, mapped, known, action):
-    return mdps.step(key, mdp, team, action), mdps.step(key, mapped, known, action)
-
-
 @pytest.mark.parametrize("modality", [CAMERA, LIDAR])
 @pytest.mark.parametrize("mapped", [classes_mdp(partly_seen_starts=False), noisy_mdp()])
 def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
@@ -220,10 +217,9 @@ def test_a_robot_alone_earns_what_the_map_mdp_gives(mapped, modality):
     known = team = reset(jax.random.key(4), mapped)
     mdp = make_mdp(mapped)
     for i, action in enumerate([0, 2, 2, 1, NOP]):
-        key = jax.random.key(10 + i)
-        (team, here), (known, there) = alone_and_on_the_map(
-            key, mdp, team, mapped, known, jnp.int32(action)
-        )
+        given = jax.random.key(10 + i), jnp.int32(action)
+        team, here = jitted(given[0], mdp, team, given[1])
+        known, there = jitted(given[0], mapped, known, given[1])
         np.testing.assert_allclose(here.reward, there.reward, rtol=1e-6)
         assert here.terminated == there.terminated
         assert float(here.seconds) == (0 if action == NOP else 1)
