@@ -144,10 +144,11 @@ def _bearing(me: Robot) -> Float[Array, ""]:
 
 
 def _is_in_the_way(me: Robot) -> Bool[Array, ""]:
-    """Whether another robot nearby drives without progress, or backs off."""
+    """Whether another robot nearby drives or faces a PoI without progress, or backs off."""
     robots, positions = me.state.robots, me.state.believed_poses[:, :2]
     waits = me.state.time - robots.progress_at > _PATIENCE
-    needs_room = (robots.phase == BACKING) | ((robots.phase == DRIVING) & waits)
+    is_at_work = (robots.phase == DRIVING) | (robots.phase == FACING)
+    needs_room = (robots.phase == BACKING) | (is_at_work & waits)
     is_near = jnp.linalg.norm(positions - me.pose[None, :2], axis=-1) < _NEARBY
     return jnp.any(others(needs_room & is_near, me.index))
 
