@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxsense.config import Config
-from jaxsense.core.networks import Params
 from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Fusion, Key
 from jaxsense.dqn import optimum, rewards
@@ -80,12 +79,13 @@ def train(
     config: Config,
     *,
     detections: Output,
-    fusion: Output,
-    detectors: tuple[Output, ...],
-    novelty: Output,
-) -> dict[str, Output]:
-    """Trains the Q-networks, returned by the names of their stages."""
-    given = {"fusion": fusion, "detectors": detectors, "novelty": novelty}
+    **given: Output,
+) -> tuple[dict[str, Output], Output]:
+    """Trains the Q-networks, returned by the names of their stages, and the starts of episodes.
+
+    Args:
+      given: the other inputs of `_environment`.
+    """
     starts = drive(Stage("starts", _starts), detections=detections, **given)
     networks: dict[str, Output] = {}
     # A team's one network is evaluated with the first sensor.
@@ -94,14 +94,14 @@ def train(
             network,
             _begin,
             _advance,
-            _params,
+            lambda config, state, **_: state.params,
             steps=config.dqn.epochs,
             chunks=config.dqn.epochs // config.dqn.chunk,
             shares="dqn",
         )
         of_sensor = {"modality": jnp.int32(m), "starts": starts, "detections": detections}
         networks[network] = drive(stage, **of_sensor, **given)
-    return networks
+    return networks, starts
 
 
 def _environment(
@@ -163,11 +163,6 @@ def _advance(
     loss = jnp.where(info.is_finite, info.loss, jnp.nan)
     metrics = {"reward": reward, "evaluation": info.evaluation_return, "epsilon": info.epsilon}
     return state, Progress(loss, metrics)
-
-
-def _params(config: Config, state: DqnState, **_: Output) -> Params:
-    del config
-    return state.params
 
 
 def learner(config: Config, modality: str) -> str:

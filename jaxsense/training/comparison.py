@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,11 @@ from jaxsense.core.networks import Params
 from jaxsense.core.types import Fusion, Index, Key
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn import training as dqn
+from jaxsense.dqn.agent import Underway
 from jaxsense.dqn.episodes import Start, reference
 from jaxsense.dqn.mdp import Mdp
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Known, Values
+from jaxsense.dqn.policies import Known
 from jaxsense.dqn.starts import random_start
 from jaxsense.looks import Bank, mdp_of_one
 from jaxsense.models import Models, make_bayes, make_models
@@ -95,29 +96,27 @@ def compare_policies(
     models: Models,
     mdp: Mdp,
     config: Config,
-    own: Mapping[str, Values] | None = None,
+    random: tuple[Int[Array, "E N"], Bool[Array, "E N M"]],
 ) -> Rewards:
-    """Plays episodes with `COMPARED` and custom policies, with the same looks and starts.
+    """Plays episodes with `COMPARED`, with the same looks and starts.
 
     Args:
       key: random key.
       models: whose only Q-network is that of the robot's modality.
       mdp: from `held_out_mdp`.
       config: all settings.
-      own: custom policies by name.
+      random: classes and earlier looks of random starts.
 
     Returns:
-      Rewards from the states of `episodes.every_state`, then from `config.evaluation.num_starts`
-      random starts.
+      Rewards from the states of `episodes.every_state`, then from the random starts.
     """
     settings = config.evaluation
-    start_key, table_key, play_key = jax.random.split(key, 3)
-    starts = _every_start(start_key, mdp, config)
+    table_key, play_key = jax.random.split(key)
+    starts = jax.tree.map(lambda *x: jnp.concatenate(x), _every_state(mdp.num_pois, config), random)
     optimal = reference(table_key, mdp, models, models.bayes.labels)
-    table, names = policies.table(own), (*COMPARED, *(own or {}))
     looks = jnp.sum(starts[1][..., mdp.robots[0]], axis=-1)
     often, seldom = settings.num_repeats, -(-settings.num_repeats // 8)
-    numbers = jnp.stack([often if name in _STATE_BY_STATE else seldom for name in names])
+    numbers = jnp.stack([often if name in _STATE_BY_STATE else seldom for name in COMPARED])
 
     def begin(key: Key, classes: jax.Array, seen: jax.Array) -> tuple[Key, Start]:
         reset_key, episode_key = jax.random.split(key)
@@ -128,8 +127,8 @@ def compare_policies(
             of_each = [
                 functools.partial(optimal, known, start.state.classes)
                 if name == "optimal"
-                else functools.partial(table[name], key, models, known)
-                for name in names
+                else functools.partial(policies.POLICIES[name], key, models, known)
+                for name in COMPARED
             ]
             # By a switch, so that one program is compiled for all policies.
             return policies.best(jax.lax.switch(which, of_each)), memory
@@ -151,12 +150,12 @@ def compare_policies(
 
             return jax.lax.cond(i < numbers[which], play, lambda: sums)
 
-        return jax.lax.map(with_policy, (jnp.arange(len(names)), sums))
+        return jax.lax.map(with_policy, (jnp.arange(len(COMPARED)), sums))
 
-    zero = jnp.zeros((len(names), len(starts[0])))
+    zero = jnp.zeros((len(COMPARED), len(starts[0])))
     sums = jax.lax.fori_loop(0, often, repeat, (zero, zero))
     total, first = (x / numbers[:, None] for x in sums)
-    return {name: (total[i], first[i]) for i, name in enumerate(names)}
+    return {name: (total[i], first[i]) for i, name in enumerate(COMPARED)}
 
 
 def _in_groups(
@@ -175,19 +174,6 @@ def _in_groups(
     rows = jnp.resize(jnp.argsort(looks), (number, -(-len(looks) // number)))
     found = jax.lax.map(lambda of: play(*jax.tree.map(lambda x: x[of], begun)), rows)
     return jax.tree.map(jnp.zeros(len(looks)).at[rows].set, found)
-
-
-def _every_start(
-    key: Key, mdp: Mdp, config: Config
-) -> tuple[Int[Array, "S N"], Bool[Array, "S N M"]]:
-    """Classes and looks of every state of the map, then of random starts."""
-    keys = jax.random.split(key, config.evaluation.num_starts)
-    random_classes, random_seen = jax.vmap(lambda key: random_start(key, mdp))(keys)
-    classes, seen = _every_state(mdp.num_pois, config)
-    return (
-        jnp.concatenate([jnp.asarray(classes), random_classes]),
-        jnp.concatenate([jnp.asarray(seen), random_seen]),
-    )
 
 
 def _every_state(
@@ -214,12 +200,21 @@ def play_policies(
     fusion: Fusion,
     look_values: tuple[LookValues, ...],
     detections: Detections,
+    starts: tuple[Underway, Start],
     num_pois: int | None = None,
 ) -> Rewards:
-    """Runs `compare_policies` for one modality; with as many PoIs as in the arena by default."""
+    """Runs `compare_policies` for one modality, from the starts of evaluations.
+
+    With another number of PoIs than in the arena, other starts are drawn.
+    """
     models = models_of(config, fusion, look_values, (q_network,))
     mdp = held_out_mdp(config, fusion, detections, modality, num_pois)
-    return compare_policies(key, models, mdp, config)
+    start = starts[1].state.classes, starts[1].state.seen
+    if num_pois is not None:
+        start_key, key = jax.random.split(key)
+        keys = jax.random.split(start_key, config.evaluation.num_starts)
+        start = jax.vmap(lambda key: random_start(key, mdp))(keys)
+    return compare_policies(key, models, mdp, config, start)
 
 
 def play_numbers(key: Key, config: Config, **inputs: Output) -> list[Rewards]:

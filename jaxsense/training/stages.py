@@ -75,7 +75,9 @@ def train(drive: Drive, config: Config) -> None:
     values = drive(solve, classes=classes, detections=detected)
     drive(Stage("beliefs", measures.beliefs), **known)
 
-    networks = agents.train(drive, config, detectors=detectors, novelty=novelty, **known)
+    networks, known["starts"] = agents.train(
+        drive, config, detectors=detectors, novelty=novelty, **known
+    )
     for m, name in enumerate(config.modalities):
         network = networks[agents.learner(config, name)]
         given = {"modality": jnp.int32(m), "q_network": network, "look_values": values, **known}

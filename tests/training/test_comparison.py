@@ -1,6 +1,7 @@
 """Policies that are compared, on a JMVAE whose weights are set by hand."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -45,17 +46,15 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
     @jax.jit
     def compared(models):
         mdp = held_out_mdp(config, models.fusion, detections(held_out=bank), 0)
-        return comparison.compare_policies(
-            KEY, models, mdp, config, {"mine": lambda *_: always(*[0] * 3)}
-        )
+        random = jnp.zeros((4, 3), jnp.int32), jnp.zeros((4, 3, 2), bool)
+        return comparison.compare_policies(KEY, models, mdp, config, random)
 
     monkeypatch.setattr(policies, "POLICIES", dict.fromkeys(comparison.COMPARED, always))
     monkeypatch.setattr(comparison, "reference", lambda *_: lambda known, classes: always(*[0] * 3))
-    by_name = compared(models)
-    found = np.array([by_name[name] for name in (*comparison.COMPARED, "mine")])
-    assert found.shape == (6, 2, 12)  # with one of our own
+    found = np.array([*compared(models).values()])
+    assert found.shape == (5, 2, 12)
     assert len(np.unique(found[0, 0])) > 6  # of 12; without a gain a look is worth -1
-    np.testing.assert_array_equal(found, found[[0] * 6])
+    np.testing.assert_array_equal(found, found[[0] * 5])
 
 
 def test_the_learned_return_is_the_mean_over_random_starts():
@@ -71,6 +70,14 @@ def test_the_learned_return_is_the_mean_over_random_starts():
     total = returned(jnp.array([1.0, 0.0, 0.0, 0.0]))
     assert -8 < total < -7 + 1 / 3**0.5
     assert np.isnan(returned(jnp.array([jnp.nan, 0.0, 0.0, 1.0])))
+
+
+def test_policies_start_where_evaluations_do(monkeypatch):
+    starts = None, SimpleNamespace(state=SimpleNamespace(classes="classes", seen="seen"))
+    given = {"modality": 0, "q_network": {}, "fusion": in_place(), "look_values": ()}
+    given |= {"detections": detections(held_out=EXACT), "starts": starts}
+    monkeypatch.setattr(comparison, "compare_policies", lambda *given: given[-1])
+    assert comparison.play_policies(KEY, CONFIG, **given) == ("classes", "seen")
 
 
 def test_groups_of_episodes_change_nothing(monkeypatch):
