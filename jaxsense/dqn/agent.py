@@ -1,19 +1,18 @@
 """The agent of a Q-network, and the environment in which it learns."""
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core import checks, networks
+from jaxsense.core import networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, Transition, pytree
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import starts
 from jaxsense.dqn.mdp import Mdp, Outcome, State
 from jaxsense.dqn.pooling import PoolingNetwork
-from jaxsense.dqn.team import Team, Travel, num_features, own_seconds, surroundings
+from jaxsense.dqn.team import TIME_SCALE, Team, Travel, num_features, surroundings
 
 
 @pytree
@@ -56,9 +55,12 @@ class Agent:
     def observe(
         self, belief: Belief, team: Team, times: Float[Array, "R N"], robot: Int[Array, ""]
     ) -> Float[Array, " S"]:
-        """Input of the Q-network: `observation`, or `[F * N]` of `surroundings`."""
+        """Input of the Q-network: mean and standard deviation of each PoI, PoI by PoI.
+
+        With travel it is `[F * N]` of `surroundings`.
+        """
         if self.travel is None:
-            return observation(belief)
+            return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
         return surroundings(belief, team, times, robot, self.num_modalities).reshape(-1)
 
     def q(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
@@ -76,18 +78,9 @@ class Agent:
             return after
         features = num_features(self.latent_size, self.num_modalities)
         known = observed.reshape(features, -1, *observed.shape[1:])
-        seconds = own_seconds(known, self.latent_size)
+        seconds = TIME_SCALE * known[2 * self.latent_size]
         of_pois = self.discount**seconds * after[:-1] - self.second_cost * seconds
         return jnp.concatenate([of_pois, after[-1:]])
-
-
-@checks.typed
-def observation(belief: Belief) -> Float[Array, " S"]:
-    """Concatenates mean and standard deviation of each PoI's belief, `[N * 2D]`, PoI by PoI."""
-    chex.assert_rank(belief.mean, 2)
-    chex.assert_equal_shape([belief.mean, belief.std])
-    checks.require_positive("belief.std", belief.std)
-    return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
 
 
 @pytree

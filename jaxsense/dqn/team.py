@@ -393,8 +393,3 @@ def surroundings(
         relative.T,
     ]
     return jnp.where(team.present[None], jnp.concatenate(rows, axis=0), 0.0)
-
-
-def own_seconds(observed: Float[Array, "F N ..."], latent_size: int) -> Float[Array, "N ..."]:
-    """The robot's own time to look at each PoI, in seconds."""
-    return TIME_SCALE * observed[2 * latent_size]

@@ -15,7 +15,6 @@ from jaxsense import dqn, mission, recorded, sim, tasks, vae
 from jaxsense.config import ConfigError, DetectorConfig
 from jaxsense.core.types import Belief, Transition
 from jaxsense.dqn import replay
-from jaxsense.dqn.agent import observation
 from jaxsense.dqn.optimum import interpolate
 from jaxsense.dqn.rewards import information
 from jaxsense.interfaces import common as interfaces_common
@@ -235,7 +234,6 @@ FUNCTIONS = [
     (lambda w: replay.init(0, 2, 1, 2), "state_size = 0"),
     (lambda w: replay.add(replay.init(3, 5, 2, 4), seen_by(7)), "transitions.s_tm1 has the shape"),
     (lambda w: replay.sample(jnp.zeros((1, 2), "bfloat16"), replay.init(1, 2, 1, 2)), "bfloat16"),
-    (lambda w: observation(Belief(w.means, w.means)), "belief.std = 0.0"),
     (lambda w: dqn.reset(w.key, w.mdp, w.classes, w.means), "seen of dtype float32: must be bool"),
     (lambda w: interfaces_common.prepared_starts(0, w.mdp, 2), "key = 0: must be one key"),
     (lambda w: interfaces_common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),

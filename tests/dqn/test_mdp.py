@@ -12,7 +12,7 @@ from toys import classes_mdp, noisy_mdp
 from jaxsense.core.types import Belief, pytree
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import starts
-from jaxsense.dqn.agent import observation
+from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.rewards import Paper
 
 NOP = 3
@@ -43,7 +43,8 @@ def start(seen=SEEN):
 
 def test_state_is_mean_and_deviation_of_one_poi_after_the_other():
     belief = Belief(jnp.array([[1.0, 2.0], [5.0, 6.0]]), jnp.array([[3.0, 4.0], [7.0, 8.0]]))
-    np.testing.assert_array_equal(observation(belief), [1, 2, 3, 4, 5, 6, 7, 8])
+    observed = Agent(0.5, 0.0, None, 2, 2, 2, ()).observe(belief, None, None, 0)  # pyright: ignore
+    np.testing.assert_array_equal(observed, [1, 2, 3, 4, 5, 6, 7, 8])
 
 
 def test_reset_writes_what_has_been_seen_and_nothing_else():
