@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsense.config import Config
 from jaxsense.config.mission import MARGIN, NODES_PER_POI, PLANNING_RADIUS, VIEW_SIDES
 from jaxsense.core import checks
-from jaxsense.core.types import Index, pytree
+from jaxsense.core.types import Index, product, pytree
 from jaxsense.sim import viewpoints
 from jaxsense.sim.arena import Layout
 
@@ -78,7 +78,9 @@ class Roadmap:
     def leads(self) -> Bool[Array, "N K"]:
         """From which nodes a path leads to a viewpoint of each PoI."""
         is_last = jnp.any(self.is_next, axis=-2)
-        return jnp.any(jnp.isfinite(self.between)[None] & is_last[:, None], axis=-1)
+        # As a product, with numbers of paths: comparing all pairs takes many times as long.
+        paths = jnp.isfinite(self.between).astype(jnp.float32)
+        return product(is_last.astype(jnp.float32), paths.T) > 0
 
     def reaches(self, position: Float[Array, "2"], leads: Bool[Array, "N K"]) -> Bool[Array, " N"]:
         """Which PoIs have a path to a viewpoint, from `leads`: cheaper than `lengths`."""
