@@ -1,11 +1,12 @@
 """The agent of a Q-network, and the environment in which it learns."""
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.core import networks
+from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
 from jaxsense.core.types import Belief, Key, Transition, pytree
 from jaxsense.dqn import mdp as mdps
@@ -59,6 +60,9 @@ class Agent:
 
         With travel it is `[F * N]` of `surroundings`.
         """
+        chex.assert_rank(belief.mean, 2)
+        chex.assert_equal_shape([belief.mean, belief.std])
+        checks.require_positive("belief.std", belief.std)
         if self.travel is None:
             return jnp.concatenate([belief.mean, belief.std], axis=-1).reshape(-1)
         return surroundings(belief, team, times, robot, self.num_modalities).reshape(-1)

@@ -234,6 +234,7 @@ FUNCTIONS = [
     (lambda w: replay.init(0, 2, 1, 2), "state_size = 0"),
     (lambda w: replay.add(replay.init(3, 5, 2, 4), seen_by(7)), "transitions.s_tm1 has the shape"),
     (lambda w: replay.sample(jnp.zeros((1, 2), "bfloat16"), replay.init(1, 2, 1, 2)), "bfloat16"),
+    (lambda w: w.models.agent.observe(Belief(w.means, w.means), 0, 0, 0), "belief.std = 0.0"),
     (lambda w: dqn.reset(w.key, w.mdp, w.classes, w.means), "seen of dtype float32: must be bool"),
     (lambda w: interfaces_common.prepared_starts(0, w.mdp, 2), "key = 0: must be one key"),
     (lambda w: interfaces_common.prepared_starts(w.key, w.mdp, 0), "number of starts = 0"),

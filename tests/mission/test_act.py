@@ -252,10 +252,9 @@ def test_a_robot_that_has_ended_makes_room_for_one_that_is_stuck(approach, facin
     state = set_robot(state, LIDAR, phase=ENDED, target=3)
     state = driving(state, set_robot, 0, 3.0, 0.0)
     assert np.any(approach(state, LIDAR).robots.wanted[LIDAR] != 0)
-    backs_off = set_robot(state, CAMERA, phase=BACKING, progress_at=2.5, backs_off_until=9.0)
-    assert np.any(approach(backs_off, LIDAR).robots.wanted[LIDAR] != 0)
-    faces = set_robot(state, CAMERA, phase=FACING)
-    assert np.any(approach(faces, LIDAR).robots.wanted[LIDAR] != 0)
+    for waits in (dict(phase=BACKING, progress_at=2.5, backs_off_until=9.0), dict(phase=FACING)):
+        waiting = approach(set_robot(state, CAMERA, **waits), LIDAR)
+        assert np.any(waiting.robots.wanted[LIDAR] != 0)
     # But not if it has failed since.
     stops = replace(state, faults=Faults(jnp.array([jnp.inf, 2.9]), state.faults.blind_at))
     np.testing.assert_array_equal(approach(stops, LIDAR).robots.wanted[LIDAR], 0.0)
