@@ -79,13 +79,12 @@ def train(
     config: Config,
     *,
     detections: Output,
-    **given: Output,
+    fusion: Output,
+    detectors: tuple[Output, ...],
+    novelty: Output,
 ) -> tuple[dict[str, Output], Output]:
-    """Trains the Q-networks, returned by the names of their stages, and the starts of episodes.
-
-    Args:
-      given: the other inputs of `_environment`.
-    """
+    """Trains the Q-networks, returned by the names of their stages, and the starts of episodes."""
+    given = {"fusion": fusion, "detectors": detectors, "novelty": novelty}
     starts = drive(Stage("starts", _starts), detections=detections, **given)
     networks: dict[str, Output] = {}
     # A team's one network is evaluated with the first sensor.

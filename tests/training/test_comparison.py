@@ -37,11 +37,8 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
         jax.nn.softmax(3 * jax.random.normal(k, (3, 64, 2)))
         for k in jax.random.split(jax.random.key(3))
     )
-    q_networks = (with_bias(jnp.zeros(4)),) * 2
-    models = models_of(CONFIG, in_place(), (constant(1.0),) * 2, q_networks)
-
-    settings = EvaluationConfig(num_starts=4, num_repeats=1, num_states=8)
-    config = replace(CONFIG, evaluation=settings)
+    models = models_of(CONFIG, in_place(), (constant(1.0),) * 2, (with_bias(jnp.zeros(4)),) * 2)
+    config = replace(CONFIG, evaluation=EvaluationConfig(num_repeats=1, num_states=8))
 
     @jax.jit
     def compared(models):
@@ -74,10 +71,12 @@ def test_the_learned_return_is_the_mean_over_random_starts():
 
 def test_policies_start_where_evaluations_do(monkeypatch):
     starts = None, SimpleNamespace(state=SimpleNamespace(classes="classes", seen="seen"))
-    given = {"modality": 0, "q_network": {}, "fusion": in_place(), "look_values": ()}
-    given |= {"detections": detections(held_out=EXACT), "starts": starts}
+    given = dict(modality=0, q_network={}, fusion=in_place(), look_values=(), starts=starts)
     monkeypatch.setattr(comparison, "compare_policies", lambda *given: given[-1])
-    assert comparison.play_policies(KEY, CONFIG, **given) == ("classes", "seen")
+    bank = detections(held_out=EXACT)
+    assert comparison.play_policies(KEY, CONFIG, detections=bank, **given) == ("classes", "seen")
+    fewer = comparison.play_policies(KEY, CONFIG, detections=bank, num_pois=2, **given)
+    assert [x.shape[1:] for x in fewer] == [(2,), (2, 2)]
 
 
 def test_groups_of_episodes_change_nothing(monkeypatch):
