@@ -130,7 +130,7 @@ class MdpConfig(Section, place="mdp"):
       look_cost: Cost of a look, in nats; only with the reward `nats`.
       min_increase: Threshold of the reward `paper`: a look that gains no more information than
         this, in inverse latent units, is rewarded with -1.
-      max_steps: Maximum length of an episode, in actions.
+      max_steps: Maximum length of an episode with `dqn.task` = `map`, in actions.
       partly_seen_starts: Whether to exclude starts where every modality has seen every PoI, or none
         has seen any.
     """

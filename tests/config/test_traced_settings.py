@@ -21,7 +21,7 @@ CONFIG = Config(
     jmvae=JmvaeConfig(hidden=(4,), steps=4, batch=4, annealing=0.5),
     mdp=MdpConfig(max_steps=3),
     dqn=DqnConfig(
-        hidden=(4,), num_envs=8, epochs=6, updates=1, batch=8, replay_capacity=32,
+        task="map", hidden=(4,), num_envs=8, epochs=6, updates=1, batch=8, replay_capacity=32,
         target_period=2,
     ),
 )  # fmt: skip
