@@ -90,7 +90,18 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     return "".join(f"| {' | '.join(row)} |\n" for row in [head, ("---",) * len(head), *safe])
 
 
-PACKAGES = ("", "config", "sim", "vae", "dqn", "mission", "training", "tasks", "interfaces")
+PACKAGES = (
+    "",
+    "config",
+    "sim",
+    "vae",
+    "dqn",
+    "mission",
+    "training",
+    "tasks",
+    "recorded",
+    "interfaces",
+)
 """Packages whose names are public; the first is `jaxsense` itself."""
 _EXTRAS = "gymnasium", "gymnax", "rejax", "stable_baselines3", "jaxmarl", "pettingzoo"
 _DEFINITION = ast.FunctionDef | ast.ClassDef

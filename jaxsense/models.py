@@ -77,7 +77,6 @@ class Models:
 
         Args:
           modality: index of the sensor; static.
-          sensor: the sensor.
           readings: `[B, ...]` readings of all rays, see `sim.cut_out`.
           bearing: bearing of the PoI in the robot's frame, in radians, positive to the left; whole
             turns do not matter.
@@ -245,7 +244,6 @@ def make_encoder(
     """Encoder of a modality as a detector.
 
     Args:
-      config: all settings.
       modality: index of the sensor.
       presence: from `make_detector`, also once trained.
       params: of the JMVAE.

@@ -90,7 +90,6 @@ def test_what_was_run_is_told_and_escaped(run):
     assert "Animation mission: robots in the arena" in text
     alternatives = re.findall('<img [^>]*alt="([^"]*)"', page)
     assert len(alternatives) == 2
-    assert all(len(alternative) > 20 for alternative in alternatives)
 
 
 HOSTILE = """<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)" style="position:fixed">

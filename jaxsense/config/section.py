@@ -277,7 +277,7 @@ class Section(Checked):
 
 
 class _Unknown:
-    """A traced number: what it is compared with is right, what is computed from it unknown."""
+    """A traced number: all comparisons hold, all results are unknown."""
 
     def _unknown(self, *_: object) -> "_Unknown":
         return self

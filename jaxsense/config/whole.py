@@ -69,7 +69,7 @@ class Config(Section):
 
     @property
     def named_code(self) -> dict[str, str]:
-        """Functions that the settings name, by their fields, and that whoever uses them runs."""
+        """Functions that the settings name, by field."""
         named = {f"sensors.{name}.make": sensor.make for name, sensor in self.sensors.items()}
         return {**named, "mdp.reward": self.mdp.reward} if ":" in self.mdp.reward else named
 

@@ -65,6 +65,7 @@ def reset_with_looks(
       marks have updated the map.
     """
     robots = jnp.asarray(mdp.robots, jnp.int32)
+    checks.require_number("number of robots", len(robots))
     checks.require_index("robots", robots, mdp.num_modalities)
     if mdp.teams is None:
         team = alone(mdp.num_pois, robots)

@@ -142,7 +142,7 @@ class MapVectorEnv(VectorEnv):
         return np.array(observations)
 
     def _infos(self) -> Infos:
-        """The actions that exist, and that all environments tell them."""
+        """Masks of existing actions, for all environments."""
         return {"action_mask": self._mask.copy(), "_action_mask": np.ones(self.num_envs, bool)}
 
 

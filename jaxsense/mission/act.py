@@ -69,10 +69,10 @@ class Course:
 def approach(
     mission: Mission, models: Models, state: MissionState, robot: Index
 ) -> tuple[MissionState, Course]:
-    """Is on its way to the viewpoint, turns to the PoI, and backs off without progress.
+    """Driving to a viewpoint, turning to the PoI, and backing off without progress.
 
-    It looks on the way as soon as it sees the PoI from where a look is new, but after a failure
-    from the viewpoint itself.
+    A robot looks as soon as it sees the PoI from where a look is new; after a failure, from the
+    viewpoint itself.
 
     Returns:
       The next state, and where the robot wants to move, see `steer`.

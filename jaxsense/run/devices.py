@@ -223,7 +223,6 @@ def side_by_side(
 
     Args:
       function: of one of them.
-      works: the works.
       threads: how many calls run at once.
       fail: asks the calls to end, when one has failed or Ctrl-C has been pressed.
 

@@ -179,7 +179,6 @@ class Player:
     Episode i has the same arena in every case.
 
     Attributes:
-      mission: the mission.
       batch: number of missions side by side.
     """
 

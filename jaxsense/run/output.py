@@ -98,7 +98,7 @@ def tell(text: str) -> None:
 
 
 def say(text: str) -> None:
-    """Prints a line about results that are in files; ignores output that cannot be written."""
+    """Prints a line; ignores output that cannot be written, since results are in files."""
     with contextlib.suppress(OSError):
         print(text, flush=True)
 

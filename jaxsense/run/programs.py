@@ -58,7 +58,6 @@ class Programs:
         """Starts to trace and compile in the background.
 
         Args:
-          config: all settings.
           compiler: compiles the programs.
           workers: share rows and missions.
           trainings: number after whose last call a program is released; 0 for never.

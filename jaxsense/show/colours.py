@@ -31,7 +31,7 @@ def modality_colour(modality: int) -> str:
 
 
 def policy_colour(name: str) -> str:
-    """The colour of a policy, the same in all plots; most have that of what matters less."""
+    """Colour of a policy in all plots; soft for most."""
     return _POLICIES.get(name, SOFT)
 
 

@@ -49,7 +49,6 @@ class _Scene:
     """What a film shows.
 
     Attributes:
-      config: all settings.
       end: the state in which the mission ended.
       fusion: of the map.
       record: `[F]` frames of the mission.
@@ -84,7 +83,6 @@ def draw(config: Config, recordings: Mapping[str, Recording], fusion: Fusion) ->
     """Draws missions as animated SVGs, which last equally long.
 
     Args:
-      config: all settings.
       recordings: of the missions, by their titles.
       fusion: of the map, whose prior and classes are shown in it.
 

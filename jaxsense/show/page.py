@@ -137,7 +137,7 @@ def _missions(title: str, missions: Missions, plot: Path) -> dict[str, object]:
 
 
 def _title(found: Evaluation, summary: Summary) -> str:
-    """What was evaluated, and with what where that is not what finished the run."""
+    """What was evaluated; version and devices where they differ from the run's."""
     seeds = {case.get("seed", 0) for case in found["mission"].values()}
     changed = compare.differences_of([summary, found.get("origin", compare.UNKNOWN)])
     made = "".join(f"; {name} {value}" for name, (_, value) in changed.items())

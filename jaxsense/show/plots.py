@@ -58,7 +58,6 @@ def latent_space(config: Config, posteriors: dict[str, Belief]) -> Figure:
     below, beside their names.
 
     Args:
-      config: all settings.
       posteriors: for `joint` and for each modality `[C, S, D]` beliefs.
     """
     names, classes = ["joint", *config.modalities], config.arena.classes
@@ -117,7 +116,6 @@ def scanlines(config: Config, windows: Mapping[str, np.ndarray]) -> Figure:
     scale.
 
     Args:
-      config: all settings.
       windows: for each modality `[C, window, channels]` readings, from left to right.
     """
     classes = config.arena.classes
@@ -221,7 +219,6 @@ def calibration(config: Config, reliability: Mapping[str, Reliability], belief: 
     """Whether probabilities are right: of the detectors, and of the map after several looks.
 
     Args:
-      config: all settings.
       reliability: for each modality the points of its diagram.
       belief: the block `belief` of the summary.
     """

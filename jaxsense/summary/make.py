@@ -34,7 +34,6 @@ def agent(
     """One modality's block of `dqn`.
 
     Args:
-      config: all settings.
       rewards: by policy, `[S]` total reward of an episode and `[S]` reward of its first action,
         from every state of the map, then from `config.evaluation.num_starts` random starts.
       seconds: of the training, chunk by chunk.

@@ -51,7 +51,7 @@ class Table:
 def of_metrics(
     caption: str, blocks: Mapping[str, Mapping[str, object]], metrics: Iterable[Metric]
 ) -> Table:
-    """A row for each block that has one of the metrics, a column for each that one of them has."""
+    """Blocks as rows and metrics as columns, without empty ones."""
     shown = [m for m in metrics if any(m.value(block) is not None for block in blocks.values())]
     rows = [
         (name, [metric.text(block) for metric in shown])

@@ -208,7 +208,6 @@ class Task(Environment):
         Args:
           key: random key; with the same one all policies start from the same state, and of one
             robot, the k-th look at a PoI shows the same to all.
-          act: the policy.
           memory: before the first action.
         """
 

@@ -104,7 +104,6 @@ def compare_policies(
       key: random key.
       models: whose only Q-network is that of the robot's modality.
       mdp: from `held_out_mdp`.
-      config: all settings.
       random: classes and earlier looks of random starts.
 
     Returns:

@@ -34,11 +34,10 @@ def best(
     restarts: tuple[tuple[Params, jax.Array], ...],
     detections: Detections | None = None,
 ) -> Params:
-    """Parameters of the best restart, of finite ones; of the first if none is finite.
+    """Parameters of the best finite restart, or of the first.
 
-    It has the lowest loss of those whose beliefs class probabilities are read from exactly; if
-    there are none, it is the one from which they are read most exactly. Without detections it has
-    the lowest loss.
+    The best has the lowest loss; given detections, the lowest of those with exact class
+    probabilities, or else the most exact ones.
     """
     if len(restarts) == 1:
         return restarts[0][0]

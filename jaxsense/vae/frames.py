@@ -19,7 +19,7 @@ _NEAR = 1.15  # depth within which a beam is on the PoI
 _BESIDE = 1.15  # half-widths within which it is
 _DEPTHS = -1.4, 2.1  # beyond which depth tells nothing of the PoI
 _AHEAD = 0.1  # rad, half the width of a PoI's front
-_NOTHING = 0.05  # beams, as many as which a place without any counts as having hit nothing
+_NOTHING = 0.05  # beams on nothing that a place without any beam counts as
 _DARK = 0.03  # keeps chromaticity finite
 
 

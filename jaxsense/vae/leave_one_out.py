@@ -29,7 +29,7 @@ from jaxsense.vae.jmvae import Jmvae, annealed_beta
 from jaxsense.vae.readout import Readout
 
 _EMBEDDING = 64  # numbers that a network finds in a look
-_FIRST_ALPHA = 0.1  # weight of divergences before alpha sets in, with a fixed joint posterior
+_FIRST_ALPHA = 0.1  # weight of divergences at first, with a fixed joint posterior
 _ALPHA_START, _ALPHA_RAMP = 0.4, 0.2  # of the training
 _LOG_VARIANCES = -10.0, 6.0
 _TRIES, _MOVES = 16, 30  # of k-means

@@ -242,6 +242,7 @@ FUNCTIONS = [
     (lambda w: readout.plausible_classes(w.belief_of(mean=NAN), w.means), "belief.mean = nan"),
     (lambda w: information(w.x), "std = 0.0: must be greater than 0"),
     (lambda w: dqn.reset(w.key, w.mdp, BAD), "classes = 7"),
+    (lambda w: dqn.reset(w.key, dataclasses.replace(w.mdp, robots=())), "number of robots = 0"),
     (lambda w: dqn.step(w.key, w.mdp, w.state, jnp.int32(4)), "action = 4"),
     (lambda w: mission.rollout(w.key, None, None, None, 0), "steps = 0"),
     (lambda w: make_mdp(OTHERS, w.models), "models.fusion holds 3 classes in 2 dimensions: must"),
