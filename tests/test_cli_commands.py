@@ -139,13 +139,14 @@ def test_the_demo_writes_one_page_with_both_films(played, capsys):
     text = page.read_text()
     (films,) = re.findall('<figure class="films">.*</svg>', text, re.DOTALL)
     assert films.count('<svg class="film"') == 2
-    assert "latent policy" in films
-    assert "naive policy" in films
-    assert "python -m jaxsense.demo --preset default --seed 3" in text
-    assert 'load_pretrained("default")' in text
+    assert {*re.findall(r"(\w+) policy", films)} == {"latent", "naive"}
+    again = "python -m jaxsense.demo --preset default --seed 3", 'load_pretrained("default")'
+    about = "one mission of many", "under <i>What learning is worth</i>"
+    for each in (*again, *about, '<th scope="row">naive</th>'):
+        assert each in text
     assert re.search(r'<th scope="row">latent</th>\s*<td>.*0\.667', text)
-    assert re.search(r'<th scope="row">naive</th>', text)
     told = capsys.readouterr().out
+    assert "This is one mission of many; averages: README, What learning is worth.\n" in told
     assert f"The page is {page.relative_to(played)}.\n" in told
     assert "Next: python -m jaxsense tasks\n" in told
     demo.main(NO_CACHE)

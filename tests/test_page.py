@@ -89,7 +89,7 @@ def test_what_was_run_is_told_and_escaped(run):
     assert f"evaluate {shlex.quote(str(run))} --episodes" in text
     assert "Animation mission: robots in the arena" in text
     alternatives = re.findall('<img [^>]*alt="([^"]*)"', page)
-    assert len(alternatives) == 2
+    assert [len(alternative) > 20 for alternative in alternatives] == [True, True]
 
 
 HOSTILE = """<svg xmlns="http://www.w3.org/2000/svg" onload="alert(1)" style="position:fixed">

@@ -15,7 +15,7 @@ from jaxsense.dqn.mdp import Mdp, Outcome, State
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team import TIME_SCALE, Team, Travel, num_features, surroundings
 
-_LEAST_DISCOUNT = 1e-30
+_LEAST_DISCOUNT = 1e-30  # not 0 in float32: a far look keeps the sign of its value
 
 
 @pytree
@@ -85,7 +85,6 @@ class Agent:
         features = num_features(self.latent_size, self.num_modalities)
         known = observed.reshape(features, -1, *observed.shape[1:])
         seconds = TIME_SCALE * known[2 * self.latent_size]
-        # Not 0 in float32: the sign of a far look's value remains.
         discount = jnp.maximum(self.discount**seconds, _LEAST_DISCOUNT)
         of_pois = discount * after[:-1] - self.second_cost * seconds
         return jnp.concatenate([of_pois, after[-1:]])

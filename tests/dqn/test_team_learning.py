@@ -58,9 +58,8 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     # The same for a batch in the last axis.
     both = agent.values(jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1))
     np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)
-    # An hour away, a look keeps its sign.
     far = Agent(0.2, 0.0, TRAVEL, 3, 1, 1, (8,)).values(jnp.array([1.0, -1, -1, 0]), 900 * seen)
-    assert jnp.sign(far).tolist() == [1, -1, -1, 0]
+    assert jnp.sign(far).tolist() == [1, -1, -1, 0]  # half an hour away and more
 
 
 @pytest.fixture(scope="module")
