@@ -18,7 +18,7 @@ from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import checks
 from jaxsense.core.types import Fusion, Index, Key, Samples, pytree
 from jaxsense.dqn import rewards
-from jaxsense.dqn.mdp import Looks, Mdp
+from jaxsense.dqn.mdp import LookSource, Mdp
 from jaxsense.dqn.team import Places, Teams
 from jaxsense.models import Models, make_travel, require_fitting
 from jaxsense.sim import world as worlds
@@ -97,7 +97,7 @@ class Bank:
         modality: int,
         distance: Float[Array, ""] | float = 0.0,
     ) -> tuple[Float[Array, " D_m"], Int[Array, " N"]]:
-        """Draws a look at the PoI's class from about as far, see `Looks.observe`."""
+        """Draws a look at the PoI's class from about as far, see `LookSource.observe`."""
         samples, which = self.features[modality], scene[poi]
         # A key from a split is as random as a draw from it.
         draw, number = jax.random.key_data(key)[-1], samples.shape[1]
@@ -122,7 +122,7 @@ def by_distance(features: Samples, distances: tuple[Float[Array, "C S"], ...]) -
     return Bank(tuple(ranked), tuple(jnp.sort(far, axis=1) for far in distances))
 
 
-def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
+def make_mdp(config: Config, models: Models, looks: LookSource | None = None) -> Mdp:
     """Makes the MDP of `config.dqn.task`: of one robot with the first sensor, or of random teams.
 
     `Mdp.of` gives the robot another sensor.
@@ -169,14 +169,14 @@ def make_mdp(config: Config, models: Models, looks: Looks | None = None) -> Mdp:
 
 
 def mdp_of_one(
-    config: Config, fusion: Fusion, looks: Looks, modality: Index, num_pois: int | None = None
+    config: Config, fusion: Fusion, looks: LookSource, modality: Index, num_pois: int | None = None
 ) -> Mdp:
     """The MDP of one robot without travel, with as many PoIs as in the arena by default."""
     number = config.arena.num_pois if num_pois is None else num_pois
     return Mdp(looks, fusion, rewards.make(config.mdp), config.mdp, number, (modality,))
 
 
-def _require_fitting(config: Config, models: Models, looks: Looks) -> None:
+def _require_fitting(config: Config, models: Models, looks: LookSource) -> None:
     """Raises `ValueError` if looks of this package match neither the settings nor the models."""
     if isinstance(looks, Bank):
         checks.require_one_each("looks", looks.features, config.modalities)

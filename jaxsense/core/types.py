@@ -195,6 +195,11 @@ class Transition:
     s_t: jax.Array
 
 
+def within_a_turn(angle: jax.Array) -> jax.Array:
+    """Angles in radians, turned to where they are from -pi to pi."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
 def is_static(index: Index) -> bool:
     """Whether an index is known while tracing."""
     return isinstance(index, int | np.integer)

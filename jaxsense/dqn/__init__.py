@@ -3,7 +3,7 @@
 from jaxsense.dqn import replay as replay
 from jaxsense.dqn.agent import Agent as Agent
 from jaxsense.dqn.agent import Environment as Environment
-from jaxsense.dqn.mdp import Looks as Looks
+from jaxsense.dqn.mdp import LookSource as LookSource
 from jaxsense.dqn.mdp import Mdp as Mdp
 from jaxsense.dqn.mdp import Outcome as Outcome
 from jaxsense.dqn.mdp import State as State

@@ -42,7 +42,7 @@ NEVER = 1e6
 """Coordinate of a place far from everything, where no look has been, in metres."""
 
 
-class Looks(Protocol):
+class LookSource(Protocol):
     """Protocol of the source of an MDP's looks, for example `Bank` or `Live`; a frozen pytree."""
 
     @property
@@ -84,7 +84,7 @@ class Mdp:
       teams: how robots travel; None for one robot that looks once in each step.
     """
 
-    looks: Looks
+    looks: LookSource
     fusion: Fusion
     reward: Reward
     config: MdpConfig
@@ -217,7 +217,7 @@ class Outcome:
       truncated: `[]` bool, the episode has reached its limit of steps.
       seconds: `[]` that passed; without travel, 1 for a look.
       poi: `[]` int32 that was looked at; N for none.
-      distance: `[]` from which, in metres; see `Looks.observe`.
+      distance: `[]` from which, in metres; see `LookSource.observe`.
     """
 
     reward: jax.Array

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.learning import TeamConfig
 from jaxsense.core.novelty import Novelty
-from jaxsense.core.types import Belief, Index, Key, pytree
+from jaxsense.core.types import Belief, Index, Key, pytree, within_a_turn
 
 TIME_SCALE = 10.0
 """Unit of travel times in observations, in seconds."""
@@ -215,8 +215,7 @@ class Travel:
     def _way(self, pose: jax.Array, place: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """`[]` radians to turn, `[]` metres straight on until it sees, and `[2]` which way."""
         to_place = place - pose[:2]
-        turn = jnp.arctan2(to_place[1], to_place[0]) - pose[2]
-        turn = (turn + jnp.pi) % (2 * jnp.pi) - jnp.pi
+        turn = within_a_turn(jnp.arctan2(to_place[1], to_place[0]) - pose[2])
         # At zero distance the bearing is undefined: do not turn.
         distance = jnp.linalg.norm(to_place)
         turn = jnp.where(distance > 0, turn, 0.0)

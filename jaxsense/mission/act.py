@@ -14,7 +14,7 @@ from jaxsense.config.mission import CONTROL_PERIOD, Search
 from jaxsense.core.types import Index, Key, call, others, pytree
 from jaxsense.mission import navigation
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, views
-from jaxsense.mission.maps import Learned
+from jaxsense.mission.maps import Change
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -178,7 +178,7 @@ def scan(
         keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
         aims = jax.vmap(functools.partial(_aim, mission, models, robot))(keys[0], states)
 
-        def look(i: int) -> tuple[Bool[Array, " S"], Learned]:
+        def look(i: int) -> tuple[Bool[Array, " S"], Change]:
             alone = functools.partial(_look, mission, models, robot, carried[i])
             return jax.vmap(alone)(keys[1], states, aims)
 
@@ -244,7 +244,7 @@ def _look(
     key: Key,
     state: MissionState,
     aim: _Aim,
-) -> tuple[Bool[Array, ""], Learned]:
+) -> tuple[Bool[Array, ""], Change]:
     """Whether a scan detects its PoI with enough confidence, and what it would change."""
     config, sensor, bearing = mission.config, mission.world.sensors[modality], aim.bearing
     search = Search(*config.mission.localisation.search)
@@ -268,7 +268,7 @@ def _write(
     message_key: Key,
     state: MissionState,
     detects: Bool[Array, ""],
-    learned: Learned,
+    learned: Change,
 ) -> MissionState:
     """Records a scan; if it detects the PoI, updates the map and tells the other robots."""
     me = Robot(mission, state, robot)

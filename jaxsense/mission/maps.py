@@ -165,7 +165,7 @@ class Contents:
 
 
 @pytree
-class Learned:
+class Change:
     """What a look changes.
 
     Attributes:
@@ -213,14 +213,14 @@ class SharedMap(Contents):
         features: Float[Array, " D_m"],
         modality: int,
         weight: Float[Array, ""],
-    ) -> Learned:
+    ) -> Change:
         """What one more look changes.
 
         Args:
           weight: `[]` share of the look that is new evidence, see `core.novelty`.
         """
         belief, seen = jax.tree.map(lambda x: x[poi], (self.belief, self.times_seen > 0))
-        return Learned(
+        return Change(
             belief=models.fusion.update(belief, seen, features, modality, weight),
             log_posterior=models.bayes.update(self.log_posterior[poi], features, modality, weight),
             evidence=None,
@@ -272,7 +272,7 @@ class OwnMap:
         features: Float[Array, " D_m"],
         modality: int,
         weight: Float[Array, ""],
-    ) -> Learned:
+    ) -> Change:
         """What one more look changes in the map of all looks, and what the robot remembers of it.
 
         Args:
@@ -284,7 +284,7 @@ class OwnMap:
         )
         before = self.memory.total(self.memory.taken(), self.num_pois)
         after: Evidence = jax.tree.map(lambda rows, new: rows[poi] + new, before, found)
-        return Learned(
+        return Change(
             belief=belief_of(models.fusion, after.log_likelihood),
             log_posterior=jax.nn.log_softmax(models.bayes.prior + after.exact),
             evidence=found,

@@ -33,7 +33,7 @@ _SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # 
 
 
 @dataclasses.dataclass(frozen=True)
-class Learned:
+class TrainingResults:
     """The results of a training.
 
     Attributes:
@@ -52,10 +52,10 @@ class Learned:
     reliability: dict[str, Reliability]
     posteriors: dict[str, Belief]
     rewards: dict[str, dict[str, np.ndarray]]
-    results: blocks.Learned
+    results: blocks.TrainingBlocks
 
 
-def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
+def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> TrainingResults:
     """Trains everything and summarises it; see `train`."""
     config, (outputs, curves) = programs.config, train(key, programs, checkpoints)
     posteriors, latent = jax.tree.map(np.asarray, outputs["latent_space"])
@@ -71,7 +71,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
         is_known = has_optimum(outputs["fusion"], values, is_sound)
         return make.agent(config, rewards, seconds, others, is_known)
 
-    return Learned(
+    return TrainingResults(
         models=stages.models(outputs, config),
         windows={
             sensor.name: sensor.from_left(windows[:, 0])
@@ -98,7 +98,7 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> Learned:
 
 
 def play(
-    key: Key, programs: Programs, learned: Learned, checkpoints: Checkpoints
+    key: Key, programs: Programs, learned: TrainingResults, checkpoints: Checkpoints
 ) -> tuple[missions.Played, blocks.Missions]:
     """Plays the missions of a run, forgets its unfinished trainings, and summarises the missions.
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from jaxsense.config import Config
 from jaxsense.run import files
 from jaxsense.run.missions import Played
-from jaxsense.run.pipeline import Learned
+from jaxsense.run.pipeline import TrainingResults
 from jaxsense.show import film, page, plots
 from jaxsense.summary.blocks import Missions, Results, Summary
 
@@ -31,7 +31,7 @@ def svg(figure: Figure) -> bytes:
     return f"{head}{_STYLE}{defs}{rest}".encode()
 
 
-def of_training(config: Config, learned: Learned) -> Pictures:
+def of_training(config: Config, learned: TrainingResults) -> Pictures:
     """The plots of a training."""
     belief = learned.results["belief"]
     figures = {
@@ -43,7 +43,9 @@ def of_training(config: Config, learned: Learned) -> Pictures:
     return {f"{name}.svg": svg(figure) for name, figure in figures.items()}
 
 
-def of_missions(config: Config, learned: Learned, played: Played, block: Missions) -> Pictures:
+def of_missions(
+    config: Config, learned: TrainingResults, played: Played, block: Missions
+) -> Pictures:
     """The plot of missions and the film of one, also under naive exploration."""
     missions = {f"{name} policy": each for name, each in played.recordings.items()}
     films = film.draw(config, missions, learned.models.fusion)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsense.config.scene import ArenaConfig, ViewpointConfig
-from jaxsense.core.types import Index, Key, pytree
+from jaxsense.core.types import Index, Key, pytree, within_a_turn
 from jaxsense.sim import amiro
 from jaxsense.sim.arena import Layout
 from jaxsense.sim.sensors import Sensor
@@ -25,8 +25,7 @@ def bearing(
     """Bearing of a position in a robot's frame, positive to the left, within -pi and pi."""
     chex.assert_shape(pose, (3,))
     offset = position - pose[:2]
-    angle = jnp.arctan2(offset[1], offset[0]) - pose[2]
-    return (angle + jnp.pi) % (2 * jnp.pi) - jnp.pi
+    return within_a_turn(jnp.arctan2(offset[1], offset[0]) - pose[2])
 
 
 def free_room(

@@ -209,7 +209,7 @@ Missions = dict[str, Case]
 """`mission`: the cases by name, policies and robots that fail."""
 
 
-class Learned(TypedDict):
+class TrainingBlocks(TypedDict):
     """The blocks of a summary that come from a training."""
 
     detectors: dict[str, Detector]
@@ -218,7 +218,7 @@ class Learned(TypedDict):
     dqn: dict[str, Agent]
 
 
-class Results(Learned):
+class Results(TrainingBlocks):
     """The blocks of a summary that come from a training and its missions."""
 
     mission: Missions

@@ -86,13 +86,13 @@ def train(drive: Drive, config: Config) -> None:
             drive(Stage(f"numbers_{name}", comparison.play_numbers, shares="numbers"), **given)
 
 
-_Learned = tuple[tuple[Output, ...], Output, Output, Output, dict[str, Output]]
+_Perception = tuple[tuple[Output, ...], Output, Output, Output, dict[str, Output]]
 """Detectors, parameters of the JMVAE, class beliefs, detections, and what looks show together."""
 
 
 def _learn_from_detections(
     drive: Drive, config: Config, *, surveys: Output, examples: Output
-) -> _Learned:
+) -> _Perception:
     """Trains detectors, and a JMVAE on what they say."""
     given = {"surveys": surveys, "examples": examples}
     stages = [detections.detector_stage(m, config) for m in range(len(config.modalities))]
@@ -108,7 +108,7 @@ def _learn_from_detections(
 
 def _learn_from_scans(
     drive: Drive, config: Config, *, surveys: Output, examples: Output
-) -> _Learned:
+) -> _Perception:
     """Trains a JMVAE on scans, whose encoders serve as detectors; see `scans`."""
     seen = drive(Stage("views", scans.views), surveys=surveys)
     each = tuple(drive(stage, views=seen) for stage in restarts(config, scans.start))

@@ -17,7 +17,7 @@ from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.mission import act, maps
 from jaxsense.mission.begin import start
-from jaxsense.mission.maps import MOST_LOOKS, Evidence, Learned, OwnMap, SharedMap
+from jaxsense.mission.maps import MOST_LOOKS, Change, Evidence, OwnMap, SharedMap
 from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
@@ -198,7 +198,7 @@ def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
 
 def test_a_robot_remembers_and_tells_what_it_has_detected(own_team, own_arena, set_robot):
     state = set_robot(own_arena(POSITIONS, POSES), 1, target=2)
-    learned = Learned(Belief(*jnp.ones((2, 2))), jnp.zeros(3), NOTHING)
+    learned = Change(Belief(*jnp.ones((2, 2))), jnp.zeros(3), NOTHING)
     write = jax.jit(lambda state, *found: act._write(own_team, 1, jax.random.key(0), state, *found))
     after = write(replace(state, steps=jnp.int32(4)), jnp.bool_(True), learned).memory
     np.testing.assert_array_equal(after.number, [0, 1])
