@@ -50,7 +50,7 @@ class Live:
         return len(self.detectors)
 
     def scene(self, key: Key, classes: Int[Array, " N"]) -> Scene:
-        """Random scene with PoIs of `[N]` int32 classes."""
+        """Random scene with PoIs of the given classes."""
         return worlds.random_scene(key, self.world, classes)
 
     def observe(
@@ -218,7 +218,7 @@ def surveys(
     """Surveys many scenes, see `sim.world.survey`.
 
     Returns:
-      For each modality `[S, N, F]` windows, and `[S, M, N]` expected distances.
+      For each modality the windows of all PoIs, and their expected distances.
     """
     number = len(keys)
     chunk = min(_SCENES_AT_ONCE, number)

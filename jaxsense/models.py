@@ -77,7 +77,7 @@ class Models:
 
         Args:
           modality: index of the sensor; static.
-          readings: `[B, ...]` readings of all rays, see `sim.cut_out`.
+          readings: of all rays, see `sim.cut_out`.
           bearing: bearing of the PoI in the robot's frame, in radians, positive to the left; whole
             turns do not matter.
           distance: distance at which the PoI's centre is expected, in metres.
@@ -104,7 +104,7 @@ class Models:
     ) -> Detection:
         """What a look says, from the rays that the detector reads; otherwise as `detect`.
 
-        `readings` are `[window, ...]`, around the PoI's bearing; with a search, those of
+        `readings` are those of the window around the PoI's bearing; with a search, those of
         `sim.windows.widened`.
         """
         wide, bearing = windows.widened(sensor, search), windows.wrapped(bearing)
@@ -118,7 +118,7 @@ class Models:
         return detectors.search(detector, *tried)
 
     def plausible_classes(self, belief: Belief) -> Bool[Array, " C"]:
-        """Classes that are plausible given a `[D]` belief, see `vae.readout`."""
+        """Classes that are plausible given a belief, see `vae.readout`."""
         return readout.plausible_classes(belief, self.fusion.classes.mean)
 
 

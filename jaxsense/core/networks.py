@@ -22,7 +22,7 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array | np.ndarray, "F ..."]) -> Float[Array, "{self.size} ..."]:
-        """Maps `[F]` to `[size]`, or `[F, B]` to `[size, B]`."""
+        """Applies the layer to one example, or to a batch along the last axis."""
         kernel = self.param("kernel", self.kernel_init, (x.shape[0], self.size))
         bias = self.param("bias", nn.initializers.zeros_init(), (self.size,))
         return product(kernel.T, x) + bias.reshape(-1, *[1] * (x.ndim - 1))
@@ -36,7 +36,7 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array | np.ndarray, "F ..."]) -> Float[Array, "{self.outputs} ..."]:
-        """Maps `[F]` to `[outputs]`, or `[F, B]` to `[outputs, B]`."""
+        """Applies all layers to one example, or to a batch along the last axis."""
         for i, size in enumerate(self.hidden):
             x = nn.relu(Dense(size, nn.initializers.he_normal(), name=f"Dense_{i}")(x))
         last = nn.initializers.lecun_normal()
@@ -52,7 +52,7 @@ def init(key: jax.Array, network: nn.Module, inputs: int) -> Params:
 def apply(
     network: nn.Module, params: Params, *x: Float[Array | np.ndarray, "F ..."]
 ) -> Float[Array, "A ..."]:
-    """Applies a network to inputs of `[F]` or `[F, B]`; returns `[A]` or `[A, B]`."""
+    """Applies a network to one example, or to a batch along the last axis."""
     return jnp.asarray(network.apply(params, *x))
 
 

@@ -41,16 +41,16 @@ class Novelty:
     length: Float[Array, " M"]
 
     def weight(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """`[...]` shares of looks that are new evidence, above 0 and up to 1.
+        """Shares of looks that are new evidence, above 0 and up to 1.
 
         Args:
-          apart: `[..., K]` distances from K earlier looks by this sensor at the PoI, in metres;
-            infinite for none.
+          apart: distances from K earlier looks by this sensor at the PoI, in metres; infinite for
+            none.
         """
         return _weight(apart, self.strength[modality], self.length[modality])
 
     def to_go(self, apart: Float[Array, "*S K"], modality: Index) -> Float[Array, "*S"]:
-        """`[...]` metres to where at least `LEAST_NEW` of a look is new; 0 where it is already.
+        """Metres to where at least `LEAST_NEW` of a look is new; 0 where it is already.
 
         Straight away from the earlier looks, as if all that count were at the nearest one; for
         `apart` see `weight`.
@@ -80,9 +80,9 @@ def fit(
     likelihoods alone accept too much confidence in looks that repeat an error.
 
     Args:
-      found: `[S, T, C]` log-likelihoods of the classes given each of T looks at a PoI.
-      positions: `[S, T, 2]` places of the looks, in metres.
-      classes: `[S]` int32 true classes.
+      found: log-likelihoods of the classes given each of T looks at a PoI.
+      positions: places of the looks, in metres.
+      classes: true classes.
     """
     chex.assert_rank([found, classes], [3, 1])
     chex.assert_shape(positions, (*found.shape[:2], 2))

@@ -172,7 +172,7 @@ class Fusion(Protocol):
         ...
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
-        """Probability of each class according to a `[D]` belief."""
+        """Probability of each class according to a belief."""
         ...
 
 

@@ -130,7 +130,6 @@ class Environment:
         """Lets one robot choose.
 
         Args:
-          key: random key.
           state: before the choice.
           s_tm1: what `observe` returned for the state.
           action: the choice.

@@ -82,7 +82,7 @@ def run_episode(
       memory: before the first action.
 
     Returns:
-      `[]` total reward, without discount, less the price of all robots' time; and that of the first
+      Total reward, without discount, less the price of all robots' time; and that of the first
       action.
     """
     policy_key, looks_key = jax.random.split(key)
@@ -158,7 +158,7 @@ def every_state(
     If there are more than `limit`, it takes a fixed stratified sample.
 
     Returns:
-      `[S, N]` int32 classes and `[S, N, M]` bool looks.
+      Classes of the PoIs, and which modality has looked at which PoI.
     """
     # A state is a number: a digit for the class of each PoI, then a bit for each look.
     num_bits = num_pois * num_modalities
@@ -177,7 +177,7 @@ def every_state(
 
 
 def are_different(classes: Int[np.ndarray, "S N"]) -> Bool[np.ndarray, " S"]:
-    """`[S]` bool, whether all of `[S, N]` classes differ, as in the paper's `N! 2^(N M)` states."""
+    """Whether all classes of a state differ, as in the paper's `N! 2^(N M)` states."""
     return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)
 
 
@@ -221,8 +221,8 @@ def expected_rewards(key: Key, mdp: Mdp, num_draws: int = _NUM_DRAWS) -> Float[A
     """Expected reward of one robot's look, by class and earlier looks.
 
     Returns:
-      `[2^M, C]` mean reward of looking at a PoI of class c after looks by the modalities m whose
-      bits m are set in the first index.
+      Mean reward of looking at a PoI of class c after looks by the modalities m whose bits m are
+      set in the first index.
     """
 
     def reward(given: tuple[Key, jax.Array, jax.Array]) -> jax.Array:

@@ -68,7 +68,7 @@ class LookSource(Protocol):
           distance: from the PoI, in metres; 0 without travel, for a look from anywhere.
 
         Returns:
-          `[D_m]` features, and the scene after the look.
+          Features, one for each label, and the scene after the look.
         """
         ...
 
@@ -139,7 +139,7 @@ class Mdp:
         return dataclasses.replace(self, robots=(modality,), teams=teams)
 
     def information(self, belief: Belief) -> Float[Array, ""]:
-        """`[]` information of a `[D]` belief, in units of the reward."""
+        """Information of a belief, in units of the reward."""
         return self.reward.information(belief, self.fusion.class_probabilities(belief))
 
     def features(
@@ -300,7 +300,7 @@ def _look(
     stands: Float[Array, "2"],
     distance: Float[Array, ""],
 ) -> tuple[dict[str, PyTree], Float[Array, ""]]:
-    """What a robot's look changes, or NOP, and the `[]` reward."""
+    """What a robot's look changes, or NOP, and the reward."""
     is_nop, place = poi == mdp.num_pois, jnp.minimum(poi, mdp.num_pois - 1)
     old = jax.tree.map(lambda x: x[place], state.belief)
     modality, weight, looked_from = mdp.sensor(state.team, looker), 1.0, state.looked_from

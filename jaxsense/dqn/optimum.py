@@ -155,9 +155,9 @@ def value_iteration(
     Instead of classes, all may be of a sensor's labels, if the reward depends on them alone.
 
     Args:
-      likelihoods: `[C, K, C]` logarithms of the likelihoods of all classes, up to a constant, in
-        each of K equally likely looks at a PoI of each class.
-      start: `[C]` probabilities of an unseen PoI's classes; by default, they are equally likely.
+      likelihoods: for a PoI of each class and each of K equally likely looks at it, logarithms of
+        the likelihoods of all classes, up to a constant.
+      start: probabilities of an unseen PoI's classes; by default, they are equally likely.
 
     Returns:
       The values at the points of the lattice. The optimal policy takes every look whose `q` is

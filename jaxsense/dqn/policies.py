@@ -64,7 +64,7 @@ def table(own: Mapping[str, Values] | None = None) -> dict[str, Values]:
 
 
 def best(values: Float[Array, " A"]) -> Int[Array, ""]:
-    """Action of the highest value, `[]` int32, or -1 if any value is NaN."""
+    """Action of the highest value, or -1 if any value is NaN."""
     return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values)).astype(jnp.int32)
 
 

@@ -67,7 +67,7 @@ def sample(draws: Float[Array, "B 2"], replay: Replay) -> Transition:
     its equal share of the blocks of environments, in order.
 
     Args:
-      draws: `[B, 2]` uniform numbers in [0, 1), for the round and for the block.
+      draws: uniform numbers in [0, 1), for the round and for the block.
 
     Returns:
       `[S, B * W]` states, and `[B * W]` other fields.

@@ -25,7 +25,7 @@ class Reward(Protocol):
         ...
 
     def of_gain(self, gain: Float[Array, "..."]) -> Float[Array, "..."]:
-        """`[...]` rewards of looks that gain `[...]` information."""
+        """Rewards of looks, by the information that they gain."""
         ...
 
 
@@ -91,7 +91,7 @@ def information(std: Float[Array, "... D"]) -> Float[Array, "..."]:
 
 
 def entropy(probabilities: Float[Array, "... C"]) -> Float[Array, "..."]:
-    """Entropy of `[..., C]` probabilities, `[...]` in nats.
+    """Entropy of probabilities, in nats.
 
     Its gradient in a probability of 0, which is infinite, counts as 0, so that values of looks have
     gradients.

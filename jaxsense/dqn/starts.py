@@ -17,7 +17,7 @@ def random_start(key: Key, mdp: Mdp) -> tuple[Int[Array, " N"], Bool[Array, "N M
     """Random classes and earlier looks of one robot.
 
     Returns:
-      Independent `[N]` int32 classes, and `[N, M]` bool, which modality has looked at which PoI.
+      Independent classes, and which modality has looked at which PoI.
     """
     class_key, seen_key = jax.random.split(key)
     classes = jax.random.randint(class_key, (mdp.num_pois,), 0, mdp.num_classes)
@@ -39,7 +39,7 @@ def reset(
     """Starts an episode in which some modalities have looked at some of the PoIs.
 
     Args:
-      seen: `[N, M]` bool, which modality has looked at which PoI; random by default.
+      seen: which modality has looked at which PoI; random by default.
 
     Returns:
       The state, whose map holds real looks. Those at a PoI are fused in the order of the

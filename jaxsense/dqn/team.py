@@ -57,7 +57,7 @@ class Team:
         """The action, or NOP in place of a PoI that is not present.
 
         Args:
-          action: `[]` int32; returned as it is if there is no such action.
+          action: returned as it is if there is no such action.
         """
         nop = self.present.shape[0]
         is_absent = jnp.any(~self.present & (jnp.arange(nop) == action))
@@ -162,7 +162,7 @@ class Travel:
     look_seconds: jax.Array | float = 0.45
 
     def arrival(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Where a robot that drives to a PoI first sees it, `[2]` in metres."""
+        """Where a robot that drives to a PoI first sees it, in metres."""
         _, straight, along = self._way(pose, place)
         return pose[:2] + straight * along
 
@@ -266,7 +266,7 @@ class Places:
         """Draws an arena.
 
         Returns:
-          `[N, 2]` positions of the PoIs, in metres, and `[R, 3]` poses of the robots.
+          Positions of the PoIs, in metres, and poses of the robots.
         """
         num_pois, per_side = self.num_pois, self.cells_per_side
         draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
@@ -369,10 +369,10 @@ def surroundings(
       times: seconds until each robot has looked at each PoI.
 
     Returns:
-      `[F, N]`, for each PoI: mean and standard deviation of its belief; the robot's own time to
-      look at it; for each modality, how soon another robot that heads for it arrives, and how soon
-      the nearest other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality,
-      one number for each; whether the PoI is present; and its position relative to the robot.
+      For each PoI: mean and standard deviation of its belief; the robot's own time to look at it;
+      for each modality, how soon another robot that heads for it arrives, and how soon the nearest
+      other robot could, as `exp(-time / 10 s)`, 0 for none; the robot's own modality, one number
+      for each; whether the PoI is present; and its position relative to the robot.
     """
     soon = jnp.exp(-times / TIME_SCALE)
     carries = team.modality[None] == jnp.arange(num_modalities)[:, None]

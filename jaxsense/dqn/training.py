@@ -312,8 +312,8 @@ def td_error(
     """One-step Q-learning error (Mnih et al. 2015, Eq. 2) of one or many transitions.
 
     Args:
-      discount_t: `[...]` discount factor, 0 where the episode ended.
-      q_t: `[A, ...]` the target network's values after the action; no gradient flows into them.
+      discount_t: discount factor, 0 where the episode ended.
+      q_t: the target network's values after the action; no gradient flows into them.
     """
     chex.assert_equal_shape([a_tm1, r_t, discount_t])
     chex.assert_shape([q_tm1, q_t], (q_tm1.shape[0], *a_tm1.shape))

@@ -199,7 +199,6 @@ def make_vec(
 
     Args:
       task: from `jaxsense.make`, or its name.
-      num_envs: how many environments.
       agent: whose sensor looks, see `jaxsense.make`; only with a name.
       starts: number of prepared starts; by default each start is new, see `MapVectorEnv`.
       options: `autoreset_mode` and `render_mode` of `MapVectorEnv`.

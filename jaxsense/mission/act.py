@@ -322,7 +322,7 @@ def where_due(
     inside a `vmap` would take all branches. Under a `vmap`, so does this function.
 
     Args:
-      kinds: `[B]` int32; one kind by default.
+      kinds: of the rows; one kind by default.
     """
     total = len(due)
     size = min(total, max(_MIN_ROWS, total // 16))

@@ -42,9 +42,9 @@ def reset(
     """Starts a mission in a random arena with an empty map.
 
     Args:
-      policy: `[]` int32 index into `Mission.policies`; by default `latent`, the trained one.
+      policy: index into `Mission.policies`; by default `latent`, the trained one.
       faults: which robots will fail; none by default.
-      classes: `[N]` int32 classes of the PoIs; independent by default.
+      classes: of the PoIs; independent by default.
 
     Returns:
       The state. Robots stand at random positions with room around them.
@@ -83,7 +83,7 @@ def start(
 
     Args:
       paths: roadmap of the layout; computed by default.
-      pose_error: `[R, 3]` errors of localisation, see `localisation.draw`; none by default.
+      pose_error: errors of localisation, see `localisation.draw`; none by default.
     """
     config = mission.config
     num_robots, num_pois = len(config.carried), config.arena.num_pois

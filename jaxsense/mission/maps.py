@@ -94,7 +94,7 @@ class Memory:
         """Adds a look, which at first only the robot itself knows of.
 
         Args:
-          place: `[2]` from where, in metres.
+          place: from where, in metres.
         """
         # Beyond the end, which drops it.
         slot = jnp.where(applies, self.number[robot], MOST_LOOKS)
@@ -143,7 +143,7 @@ def belief_of(fusion: Fusion, log_likelihood: Float[Array, " C"]) -> Belief:
     """Belief that holds some evidence, `[D]`; the prior if there is none.
 
     Args:
-      log_likelihood: `[C]` sum of the looks' log-likelihoods, up to a constant; 0 for no looks.
+      log_likelihood: sum of the looks' log-likelihoods, up to a constant; 0 for no looks.
     """
     mixed = readout.mixture(fusion.classes, jax.nn.softmax(log_likelihood))
     is_none = jnp.all(log_likelihood == 0)
@@ -191,7 +191,7 @@ class SharedMap(Contents):
 
     @property
     def version(self) -> Int[Array, ""]:
-        """Number of looks, `[]` int32."""
+        """Number of looks."""
         return jnp.sum(self.times_seen)
 
     def read(self, models: Models) -> Contents:
@@ -217,7 +217,7 @@ class SharedMap(Contents):
         """What one more look changes.
 
         Args:
-          weight: `[]` share of the look that is new evidence, see `core.novelty`.
+          weight: share of the look that is new evidence, see `core.novelty`.
         """
         belief, seen = jax.tree.map(lambda x: x[poi], (self.belief, self.times_seen > 0))
         return Change(
@@ -241,7 +241,7 @@ class OwnMap:
 
     @property
     def version(self) -> Int[Array, ""]:
-        """Number of looks that the robot knows of, `[]` int32."""
+        """Number of looks that the robot knows of."""
         return jnp.sum(self.is_known)
 
     def read(self, models: Models) -> Contents:
@@ -276,7 +276,7 @@ class OwnMap:
         """What one more look changes in the map of all looks, and what the robot remembers of it.
 
         Args:
-          weight: `[]` share of the look that is new evidence, see `core.novelty`.
+          weight: share of the look that is new evidence, see `core.novelty`.
         """
         found = Evidence(
             log_likelihood=log_likelihood(models, features, modality, weight),
@@ -297,7 +297,7 @@ def log_likelihood(
     """Log-likelihoods of the classes given one look, up to a constant.
 
     Args:
-      weight: `[]` share of the look that is new evidence, see `core.novelty`.
+      weight: share of the look that is new evidence, see `core.novelty`.
     """
     fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
     alone = fusion.update(fusion.prior, nobody, features, modality, weight)

@@ -46,7 +46,7 @@ def ramp(
     Turning takes motor force from forward acceleration.
 
     Args:
-      wanted: `[..., 2]` wanted command, clipped to the limits of speed and turn rate.
+      wanted: clipped to the limits of speed and turn rate.
       seconds: how long the command may change.
     """
     forward = jnp.clip(wanted[..., 0], -amiro.MAX_SPEED, amiro.MAX_SPEED) - command[..., 0]
@@ -69,8 +69,8 @@ def clearance(
     """Free distance around each robot, exact for the actual shapes of the PoIs.
 
     Returns:
-      `[R]` metres from a robot's outline to the nearest wall or PoI, and `[R]` to the nearest
-      robot; negative inside one.
+      Metres from a robot's outline to the nearest wall or PoI, and to the nearest robot; negative
+      inside one.
     """
     chex.assert_shape(poses, (None, 3))
     x, y = poses[:, :1], poses[:, 1:2]
@@ -129,7 +129,7 @@ def drive_to(
     plus a penalty within the inflation around obstacles.
 
     Args:
-      waypoint: `[2]` in metres.
+      waypoint: in metres.
       seconds: how long the robot keeps the command.
     """
     chex.assert_shape([waypoint, poses, commands], [(2,), (None, 3), (len(poses), 2)])
@@ -207,13 +207,13 @@ def sidestep(
     """Position to head for on a straight line that another robot may block.
 
     Args:
-      position: `[2]` of the robot, in metres.
-      waypoint: `[2]` where it is going, in metres.
-      blocking: `[K, 2]` positions of the other robots, in metres.
+      position: of the robot, in metres.
+      waypoint: where it is going, in metres.
+      blocking: positions of the other robots, in metres.
 
     Returns:
-      `[2]` the waypoint, or a position next to the blocking robot: on the shorter side with room,
-      on the right if both are equal.
+      The waypoint, or a position next to the blocking robot: on the shorter side with room, on the
+      right if both are equal.
     """
     keep = 2 * PLANNING_RADIUS + _SIDESTEP
     reach = arena.side / 2 - PLANNING_RADIUS

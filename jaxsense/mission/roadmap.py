@@ -60,11 +60,11 @@ class Roadmap:
         Ignores other robots: they will be elsewhere, or make room.
 
         Args:
-          position: `[2]` of a robot, in metres; if it is closer to a PoI than planning allows,
-            paths lead away from the PoI.
+          position: of a robot, in metres; if it is closer to a PoI than planning allows, paths lead
+            away from the PoI.
 
         Returns:
-          `[..., V]` metres; infinite where no path exists.
+          Metres; infinite where no path exists.
         """
         chex.assert_shape(position, (2,))
         is_free = self.is_free[poi]
@@ -96,7 +96,7 @@ class Roadmap:
         """Lengths of straight lines from the nodes to viewpoints, the last parts of paths.
 
         Returns:
-          `[..., K]` metres; infinite where no path may lead straight.
+          Metres; infinite where no path may lead straight.
         """
         places = self.viewpoints[poi, view][..., None, :]
         nodes = self.nodes.reshape(*[1] * (places.ndim - 2), -1, 2)
@@ -104,10 +104,10 @@ class Roadmap:
         return jnp.where(self.is_next[poi, view], apart, jnp.inf)
 
     def to_viewpoint(self, poi: Index, view: Index) -> Float[Array, " K"]:
-        """Lengths of the shortest paths from the nodes to a viewpoint, in metres.
+        """Lengths of the shortest paths from the nodes to a viewpoint.
 
         Returns:
-          `[K]` metres; infinite where there is none.
+          Metres; infinite where there is none.
         """
         return jnp.min(self.between + self.last(poi, view)[None], axis=1)
 
@@ -124,12 +124,12 @@ class Roadmap:
 
         Args:
           to_view: see `to_viewpoint`.
-          position: `[2]` of a robot in metres, see `lengths`.
-          others: `[S, 2]` positions of standing robots, in metres, which cannot be waypoints.
+          position: of a robot, in metres, see `lengths`.
+          others: positions of standing robots, in metres, which cannot be waypoints.
 
         Returns:
-          `[]` length in metres, infinite if no path exists, and `[2]` the waypoint, to which the
-          straight line is free.
+          Length in metres, infinite if no path exists, and the waypoint, to which the straight line
+          is free.
         """
         goal = self.viewpoints[poi, view][None]
         first = jnp.concatenate(self._first(position, goal))

@@ -208,7 +208,7 @@ class Mission:
 
     @property
     def modalities(self) -> Int[Array, " R"]:
-        """Index of each robot's sensor, int32."""
+        """Index of each robot's sensor."""
         return jnp.array(self.config.modality_of_robot)
 
     def map_of(self, state: MissionState, robot: Index) -> SharedMap | OwnMap:

@@ -212,7 +212,6 @@ class Program:
         """Traces a function, unless its trace is cached, and starts to compile it.
 
         Args:
-          function: what to compile.
           *args: arguments or their shapes.
           mesh: devices that share the rows of arguments and results; their number divides those.
           whole: number of arguments, the first ones, that every device gets undivided.

@@ -51,7 +51,6 @@ def write(path: Path, content: str | bytes, mode: int = 0o666, *, is_new: bool =
     """Replaces a file atomically: readers never see a part of it, even after a power failure.
 
     Args:
-      path: the file.
       content: of the file; text is encoded as UTF-8.
       mode: permissions of the file, before the umask.
       is_new: whether there must be no such file yet, nor a link.

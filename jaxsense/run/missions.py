@@ -140,7 +140,7 @@ class Ledger:
         return any(waiting and reserve.max() < 0 for waiting, reserve in parts)
 
     def reserve(self) -> Int[np.ndarray, " B"]:
-        """Begins a new reserve: `[P * S]` missions. Where a part has fewer, one fills the rest."""
+        """Begins a new reserve, one mission a slot. Where a part has fewer, one fills the rest."""
         for waiting, reserve in zip(self._waiting, self._reserve, strict=True):
             first = [*reserve[reserve >= 0].tolist(), *waiting]
             some, waiting[:] = first[: len(reserve)], first[len(reserve) :]
@@ -151,7 +151,7 @@ class Ledger:
         """Gives idle slots to missions of the reserve.
 
         Returns:
-          `[P * S]` index that each slot takes of the reserve of its part; -1 if it keeps its own.
+          Index that each slot takes of the reserve of its part; -1 if it keeps its own.
         """
         taken = np.full_like(self._playing, -1)
         for part, (playing, reserve) in enumerate(zip(self._playing, self._reserve, strict=True)):
@@ -163,7 +163,7 @@ class Ledger:
 
     @property
     def playing(self) -> Int[np.ndarray, " B"]:
-        """`[P * S]` mission in each slot; -1 in idle ones."""
+        """Mission in each slot; -1 in idle ones."""
         return self._playing.reshape(-1)
 
     def end(self, done: Bool[np.ndarray, " B"]) -> Int[np.ndarray, " _"]:

@@ -58,7 +58,6 @@ class Programs:
         """Starts to trace and compile in the background.
 
         Args:
-          compiler: compiles the programs.
           workers: share rows and missions.
           trainings: number after whose last call a program is released; 0 for never.
           policies: of missions, by name, in addition to `dqn.POLICIES`.

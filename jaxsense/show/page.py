@@ -43,7 +43,6 @@ def render(
     Args:
       run: its directory; the page shows plots `NAME.svg` and films `mission*.svg` that lie there.
       config: its settings.
-      summary: its summary.
       evaluations: further missions, by the names of their files.
 
     Raises:

@@ -140,7 +140,6 @@ def cross_section(
 
     Args:
       data: the arena's MJX state, with up-to-date `geom_xpos` and `geom_xmat`.
-      height: height of the cut.
       robot: index of the robot whose geoms to omit, because it is looking; -1 for none.
     """
     if not -1 <= robot < arena.num_robots:

@@ -55,12 +55,12 @@ class Scaling:
     scale: jax.Array
 
     def __call__(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
-        """`[N * F]` scaled from `[N, F]`, PoI by PoI."""
+        """Observation of scaled features, PoI by PoI."""
         scaled = (features - self.offset[None]) / self.scale[None]
         return jnp.clip(scaled, -CLIP, CLIP).reshape(-1)
 
     def inverse(self, observation: Float[Array, " S"]) -> Float[Array, "N F"]:
-        """`[N, F]` from `[N * F]` scaled, but for what was clipped."""
+        """Features that a scaled observation stands for, but for what was clipped."""
         scaled = observation.reshape(-1, self.offset.size)
         return scaled * self.scale[None] + self.offset[None]
 

@@ -101,7 +101,6 @@ def compare_policies(
     """Plays episodes with `COMPARED`, with the same looks and starts.
 
     Args:
-      key: random key.
       models: whose only Q-network is that of the robot's modality.
       mdp: from `held_out_mdp`.
       random: classes and earlier looks of random starts.
@@ -185,7 +184,7 @@ def _every_state(
 
 
 def permutations(config: Config) -> Bool[np.ndarray, " S"]:
-    """`[S]` whether the classes of each compared state of the map differ, as in the paper."""
+    """Whether the classes of each compared state of the map differ, as in the paper."""
     classes, _ = _every_state(config.arena.num_pois, config)
     return episodes.are_different(classes)
 

@@ -113,9 +113,9 @@ def draw_scenes(key: Key, config: Config) -> Scenes:
     """Draws keys and classes of all scenes.
 
     Returns:
-      `[S]` keys of the scenes, `[S, N]` int32 classes of their PoIs, `[S]` bool, in which scenes
-      no look shows its PoI, and `[S]` keys of the PoIs' places, of which four in a row are
-      the same if the JMVAE learns from groups of looks; otherwise None.
+      `[S]` keys of the scenes, classes of their PoIs, in which scenes no look shows its PoI, and
+      `[S]` keys of the PoIs' places, of which four in a row are the same if the JMVAE learns from
+      groups of looks; otherwise None.
     """
     class_key, scene_key = jax.random.split(key)
     numbers = num_scenes(config)

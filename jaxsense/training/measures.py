@@ -245,8 +245,8 @@ def draw_history(
     """Draws a history of looks at a PoI.
 
     Returns:
-      `[T]` int32 modality of each look, and for each modality `[T, D_m]` features, of which only
-      those of this modality count.
+      Modality of each look, and for each modality features of as many looks, of which only those by
+      this modality count.
     """
     modality_key, *row_keys = jax.random.split(key, 1 + len(bank))
     modalities = jax.random.randint(modality_key, (_LOOKS,), 0, len(bank))

@@ -47,7 +47,7 @@ class Detector(Protocol):
         ...
 
     def logits(self, window: Float[Array, " F"], distance: Float[Array, ""]) -> Float[Array, " O"]:
-        """`[D_m + 1]` of the labels and, last, log-odds that the PoI is there.
+        """Logits of the labels and, last, log-odds that the PoI is there.
 
         Args:
           window: readings around the PoI's bearing, see `sim.windows.as_window`.
@@ -81,7 +81,7 @@ class Looks:
 
 
 def log_probabilities(logits: Float[Array, "O *B"]) -> Float[Array, "O *B"]:
-    """`[D_m + 1]` of the labels and, last, of "nothing there", if half of all looks show nothing.
+    """Log-probabilities of labels and, last, of "nothing there", if half of all looks show nothing.
 
     A hierarchical softmax (Morin and Bengio 2005): the log-odds that the PoI is there do not depend
     on its label, and each level has a temperature of its own.
@@ -302,7 +302,6 @@ def retrain(
 
     Args:
       shown: looks at PoIs, see `sim.cut_out`, in random order.
-      labels: `[S]` int32 their labels.
       config: batch, learning rate, steps, and the share of looks to keep, `calibration`; static.
 
     Returns:

@@ -123,7 +123,7 @@ class Scaling:
 
 
 def scaled(frame: Frame, windows: Float[Array, "S F"]) -> tuple[Scaling, Float[Array, "S G"]]:
-    """Standardises a frame by `[S, F]` windows, which it also returns in this frame."""
+    """Standardises a frame by windows, which it also returns in this frame."""
     seen = jax.lax.map(frame, windows, batch_size=min(4096, len(windows)))
     offset, scale = networks.statistics(seen)
     return Scaling(frame, offset, scale), (seen - offset[None]) / scale

@@ -58,7 +58,7 @@ class Reader:
     model: Jmvae = struct.field(pytree_node=False)
 
     def class_probabilities(self, belief: Belief) -> Float[Array, " C"]:
-        """Probability of each class according to a `[D]` belief."""
+        """Probability of each class according to a belief."""
         return self.readout.class_probabilities(belief, self.prior)
 
 
@@ -192,7 +192,7 @@ class Filter(Reader):
 
         Args:
           params: of the networks, by modality.
-          features: `[D_m]` probabilities of the labels, or `[D_m, B]`.
+          features: probabilities of the labels.
         """
         moments = self.readout.of_classes
         network = MLP(self.hidden, moments.shape[1])

@@ -17,7 +17,7 @@ def kl_divergence(
     mean_q: _Columns | float = 0.0,
     log_var_q: _Columns | float = 0.0,
 ) -> Float[Array, "..."]:
-    """Kullback-Leibler divergence `KL(p || q)` of `[D, ...]` Gaussians, `[...]` in nats.
+    """Kullback-Leibler divergence `KL(p || q)` of Gaussians, in nats.
 
     By default q is a standard normal. `log_var` are logarithms of variances; axes after the first
     broadcast.

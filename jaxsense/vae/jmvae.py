@@ -114,7 +114,7 @@ def init(key: Key, model: Jmvae, *, scale: float = 1.0) -> Params:
 def encode(
     params: Params, model: Jmvae, features: Features
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """`[D]` mean and log-variance of the posterior `q(z | present features)`.
+    """Mean and log-variance of the posterior `q(z | present features)`.
 
     Args:
       features: for each modality `[D_m]`, or None where it is missing.
@@ -145,7 +145,7 @@ def _encode(
 
 @checks.typed
 def decode(params: Params, model: Jmvae, z: Float[Array, " D"]) -> tuple[Float[Array, "_"], ...]:
-    """Mean of `p(features | z)`, `[D_m]` for each modality, for a `[D]` latent."""
+    """Mean of `p(features | z)`, `[D_m]` for each modality."""
     checks.require_shape("z", z, (model.latent_size,))
     return _decode(params, model, z)
 
@@ -258,7 +258,7 @@ def train(
         a constant.
 
     Returns:
-      The parameters and the `[steps]` losses, of which the last is NaN if a parameter is not
+      The parameters and the loss of each step, of which the last is NaN if a parameter is not
       finite: inside `jit`, which raises no error, check the losses.
 
     Raises:

@@ -100,7 +100,7 @@ def losses(
     single looks and of sets of one by each sensor.
 
     Args:
-      noise: `[M, D, B, K]` standard normal draws.
+      noise: standard normal draws.
       model: its shape; the features of a modality are a look in the frame of its sensor.
       looks: K looks, two or more, by each sensor at each of B PoIs.
       alpha: weight of the divergences to the posteriors of fewer looks.
@@ -229,8 +229,8 @@ def calibrate(encoder: Encoder, windows: Float[Array, "S F"], classes: Int[Array
 
     Args:
       encoder: trained.
-      windows: `[S, F]` single looks that nothing was trained on.
-      classes: `[S]` int32 what all looks at their PoIs show together.
+      windows: single looks that nothing was trained on.
+      classes: what all looks at their PoIs show together.
     """
     found = jax.vmap(encoder._of_labels, out_axes=-1)(windows)
     labels = jnp.array(encoder.label_of_class)[classes]
@@ -247,7 +247,7 @@ def centres(key: Key, points: Float[Array, "S D"], number: int) -> Float[Array, 
 
 
 def nearest(points: Float[Array, "S D"], centres: Float[Array, "K D"]) -> Int[Array, " S"]:
-    """Index of the nearest centre to each point, int32."""
+    """Index of the nearest centre to each point."""
     return jnp.argmin(_distances(points, centres), axis=1).astype(jnp.int32)
 
 

@@ -77,7 +77,7 @@ def mixture(classes: Belief, probabilities: Float[Array, " C"]) -> Belief:
 
     Args:
       classes: `[C, D]` joint posterior of each class.
-      probabilities: `[C]` of sum 1.
+      probabilities: of sum 1.
     """
     chex.assert_shape(probabilities, classes.mean.shape[:1])
     checks.require_probabilities("probabilities", probabilities)
@@ -106,7 +106,7 @@ class Readout:
     whitening: Float[Array, "2*D K"]
 
     def class_probabilities(self, belief: Belief, prior: Belief) -> Float[Array, " C"]:
-        """`[C]` probabilities, each at least about 1e-6.
+        """Probabilities of the classes, each at least about 1e-6.
 
         In the `prior`, the belief before any look, all classes are equally likely.
         """
@@ -163,7 +163,7 @@ def sigma_norm(std: Float[Array, "*S D"]) -> Float[Array, "*S"]:
 
 
 def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[Array, " C"]:
-    """Classes whose `[C, D]` mean is within two standard deviations of a `[D]` belief's.
+    """Classes whose mean is within two standard deviations of a belief's.
 
     The nearest one always is plausible.
     """
@@ -175,7 +175,7 @@ def plausible_classes(belief: Belief, class_means: Float[Array, "C D"]) -> Bool[
 
 
 def _moments(belief: Belief) -> Float[Array, "... K"]:
-    """Mean and mean square, `[..., 2D]`: linear in the weights of a mixture."""
+    """Means, then mean squares: linear in the weights of a mixture."""
     return jnp.concatenate([belief.mean, belief.std**2 + belief.mean**2], axis=-1)
 
 
