@@ -1,4 +1,8 @@
-"""Scenes in simulated arenas, and looks at their PoIs."""
+"""Scenes in simulated arenas, and looks at their PoIs.
+
+`look` and `survey` stand a robot somewhere and scan. Surveys, banks and live episodes take them;
+the robots of missions stand where they have driven to, and call `scan_around` from there.
+"""
 
 import dataclasses
 
@@ -194,19 +198,38 @@ def look(
     checks.require_key(key)
     checks.require_index("robot", robot, len(world.sensors))
     checks.require_index("poi", poi, world.arena.config.num_pois)
-    given = world, scene.layout, jnp.delete(scene.poses, robot, axis=0)[:, :2], poi
+    moved = None
     if farthest is None:
         viewpoint_key, noise_key, error_key = jax.random.split(key, 3)
-        pose, bearing = random_viewpoint(viewpoint_key, *given)
     else:
         distance_key, viewpoint_key, noise_key, error_key = jax.random.split(key, 4)
-        distance = farthest * jax.random.uniform(distance_key) ** 3
-        place = scene.poses[robot, :2]
-        pose, bearing = moved_viewpoint(viewpoint_key, *given, place, distance)
-    position = scene.layout.position[poi]
-    bearing, distance = _believed(error_key, world, pose, bearing, position)
-    scene = dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose))
+        moved = farthest * jax.random.uniform(distance_key) ** 3
+    scene, believed = _stand(viewpoint_key, error_key, world, scene, robot, poi, moved)
+    bearing, distance = believed
     return (window_around(noise_key, world, scene, robot, bearing), distance), scene
+
+
+def _stand(
+    viewpoint_key: Key,
+    error_key: Key,
+    world: World,
+    scene: Scene,
+    robot: Index,
+    poi: Int[Array, ""],
+    moved: Float[Array, ""] | None = None,
+) -> tuple[Scene, tuple[Float[Array, ""], Float[Array, ""]]]:
+    """The scene with a robot at a viewpoint of a PoI, and what it believes, see `_believed`.
+
+    Args:
+      moved: distance from where the robot stands, in metres; by default anywhere.
+    """
+    given = world, scene.layout, others(scene.poses[:, :2], robot), poi
+    if moved is None:
+        pose, bearing = random_viewpoint(viewpoint_key, *given)
+    else:
+        pose, bearing = moved_viewpoint(viewpoint_key, *given, scene.poses[robot, :2], moved)
+    believed = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
+    return dataclasses.replace(scene, poses=scene.poses.at[robot].set(pose)), believed
 
 
 def window_around(
@@ -279,11 +302,8 @@ def survey(
 
     def view_of(key: Key, robot: jax.Array, poi: jax.Array) -> View:
         pose_key, error_key, absent_key = jax.random.split(key, 3)
-        around = others(scene.poses[:, :2], robot)
-        pose, bearing = random_viewpoint(pose_key, world, scene.layout, around, poi)
-        bearing, distance = _believed(error_key, world, pose, bearing, scene.layout.position[poi])
-        poses = scene.poses.at[robot].set(pose)
-        view = View(scene.layout.position, poses, away, bearing, distance)
+        stood, believed = _stand(pose_key, error_key, world, scene, robot, poi)
+        view = View(scene.layout.position, stood.poses, away, *believed)
         absent = viewpoints.without_poi(
             absent_key, world.sensors, world.arena.config, world.viewpoint, view, robot, poi
         )
