@@ -123,7 +123,7 @@ def _functions_of(config: Config, m: int, sensor: Sensor) -> dict[str, Function]
 
     def tell(models: Models, features: jax.Array, weight: jax.Array) -> Arrays:
         """The evidence of a look, for the sum of a robot's own looks."""
-        return {"evidence": maps.log_likelihood(models, features, m, weight)}
+        return {"evidence": maps.evidence_of(models, features, m, weight).log_likelihood}
 
     def write(
         models: Models, mean: jax.Array, std: jax.Array, seen: jax.Array, *look: jax.Array

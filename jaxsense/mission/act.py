@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
 from mujoco import mjx
 
 from jaxsense.config.mission import CONTROL_PERIOD, Search
-from jaxsense.core.types import Index, Key, call, others, pytree
-from jaxsense.mission import navigation
+from jaxsense.core.types import Belief, Index, Key, call, others, pytree
+from jaxsense.mission import maps, navigation
 from jaxsense.mission.decide import AT_VIEWPOINT, RECOVERY_TIME, views
-from jaxsense.mission.maps import Change
+from jaxsense.mission.maps import Evidence
 from jaxsense.mission.state import (
     ATTEMPTS,
     BACKING,
@@ -45,6 +45,9 @@ _TURNS_SLOWLY = 0.35  # rad/s, fastest turn at which a robot scans
 _MIN_ROWS = 8  # of a group; on a CPU, fewer take as long
 _NO_KIND = jnp.iinfo(jnp.int32).max
 _WRITTEN = "robots", "belief", "log_posterior", "times_seen", "looked_from", "memory"  # by a scan
+
+_Held: TypeAlias = tuple[Belief, Float[Array, "*S C"]]
+"""What the map of all looks says of a PoI: its belief, and the same by exact Bayes."""
 
 Row = TypeVar("Row")
 Result = TypeVar("Result")
@@ -178,7 +181,7 @@ def scan(
         keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
         aims = jax.vmap(functools.partial(_aim, mission, models, robot))(keys[0], states)
 
-        def look(i: int) -> tuple[Bool[Array, " S"], Change]:
+        def look(i: int) -> tuple[Bool[Array, " S"], _Held, Evidence | None]:
             alone = functools.partial(_look, mission, models, robot, carried[i])
             return jax.vmap(alone)(keys[1], states, aims)
 
@@ -244,8 +247,13 @@ def _look(
     key: Key,
     state: MissionState,
     aim: _Aim,
-) -> tuple[Bool[Array, ""], Change]:
-    """Whether a scan detects its PoI with enough confidence, and what it would change."""
+) -> tuple[Bool[Array, ""], _Held, Evidence | None]:
+    """Whether a scan detects its PoI with enough confidence, and what it would change.
+
+    Returns:
+      Whether it detects it, what the map of all looks would say of it, and what the robot would
+      remember of the look: None where all robots share a map.
+    """
     config, sensor, bearing = mission.config, mission.world.sensors[modality], aim.bearing
     search = Search(*config.mission.localisation.search)
     wide = tuple(windows.widened(each, search) for each in mission.world.sensors)
@@ -257,8 +265,12 @@ def _look(
     found = models.detect_in_window(modality, sensor, readings, bearing, aim.distance, search)
     is_confident = jnp.max(found.features) >= config.mission.least_confidence
     me = Robot(mission, state, robot)
-    learned = me.map.learn(models, me.target, found.features, modality, aim.weight)
-    return found.is_there & is_confident, learned
+    look = found.features, modality, aim.weight
+    before = state.belief, state.seen, state.log_posterior
+    belief, seen, log_posterior = jax.tree.map(lambda rows: rows[me.target], before)
+    held = models.fusion.update(belief, seen, *look), models.bayes.update(log_posterior, *look)
+    evidence = None if state.memory is None else maps.evidence_of(models, *look)
+    return found.is_there & is_confident, held, evidence
 
 
 @jax.named_scope("mission.write")
@@ -268,7 +280,8 @@ def _write(
     message_key: Key,
     state: MissionState,
     detects: Bool[Array, ""],
-    learned: Change,
+    held: _Held,
+    evidence: Evidence | None,
 ) -> MissionState:
     """Records a scan; if it detects the PoI, updates the map and tells the other robots."""
     me = Robot(mission, state, robot)
@@ -278,13 +291,13 @@ def _write(
     belief, log_posterior = jax.tree.map(
         lambda rows, new: rows.at[poi].set(jnp.where(detects, new, rows[poi])),
         (state.belief, state.log_posterior),
-        (learned.belief, learned.log_posterior),
+        held,
     )
     number = state.times_seen[poi, modality] % RECENT_LOOKS
     position, memory = me.pose[:2], state.memory
     place = jnp.where(detects, position, state.looked_from[poi, modality, number])
-    if memory is not None and learned.evidence is not None:
-        memory = memory.with_look(robot, poi, position, learned.evidence, state.time, detects)
+    if memory is not None and evidence is not None:
+        memory = memory.with_look(robot, poi, position, evidence, state.time, detects)
         sends = detects & (jnp.arange(len(memory.number)) == robot)
         settings = mission.config.mission.communication
         memory = memory.after_messages(message_key, settings, state.time, sends)

@@ -165,21 +165,6 @@ class Contents:
 
 
 @pytree
-class Change:
-    """What a look changes.
-
-    Attributes:
-      belief: belief about its PoI after all looks.
-      log_posterior: the same by exact Bayes.
-      evidence: of the look, as far as it is new; None where all robots share a map.
-    """
-
-    belief: Belief
-    log_posterior: Float[Array, " C"]
-    evidence: Evidence | None
-
-
-@pytree
 class SharedMap(Contents):
     """The map of all looks, which every robot knows without delay.
 
@@ -205,26 +190,6 @@ class SharedMap(Contents):
         """Distances from the recent looks by a sensor at a PoI, in metres; infinite for none."""
         places = self.looked_from[poi, modality]
         return jnp.linalg.norm(positions[:, None] - places[None], axis=-1)
-
-    def learn(
-        self,
-        models: Models,
-        poi: Int[Array, ""],
-        features: Float[Array, " D_m"],
-        modality: int,
-        weight: Float[Array, ""],
-    ) -> Change:
-        """What one more look changes.
-
-        Args:
-          weight: share of the look that is new evidence, see `core.novelty`.
-        """
-        belief, seen = jax.tree.map(lambda x: x[poi], (self.belief, self.times_seen > 0))
-        return Change(
-            belief=models.fusion.update(belief, seen, features, modality, weight),
-            log_posterior=models.bayes.update(self.log_posterior[poi], features, modality, weight),
-            evidence=None,
-        )
 
 
 @pytree
@@ -265,40 +230,18 @@ class OwnMap:
         away = positions[:, None] - looks.place.reshape(1, -1, 2)
         return jnp.where(counts.reshape(1, -1), jnp.linalg.norm(away, axis=-1), jnp.inf)
 
-    def learn(
-        self,
-        models: Models,
-        poi: Int[Array, ""],
-        features: Float[Array, " D_m"],
-        modality: int,
-        weight: Float[Array, ""],
-    ) -> Change:
-        """What one more look changes in the map of all looks, and what the robot remembers of it.
 
-        Args:
-          weight: share of the look that is new evidence, see `core.novelty`.
-        """
-        found = Evidence(
-            log_likelihood=log_likelihood(models, features, modality, weight),
-            exact=weight * models.bayes.log_likelihoods(features, modality),
-        )
-        before = self.memory.total(self.memory.taken(), self.num_pois)
-        after: Evidence = jax.tree.map(lambda rows, new: rows[poi] + new, before, found)
-        return Change(
-            belief=belief_of(models.fusion, after.log_likelihood),
-            log_posterior=jax.nn.log_softmax(models.bayes.prior + after.exact),
-            evidence=found,
-        )
-
-
-def log_likelihood(
+def evidence_of(
     models: Models, features: Float[Array, " D_m"], modality: int, weight: Float[Array, ""]
-) -> Float[Array, " C"]:
-    """Log-likelihoods of the classes given one look, up to a constant.
+) -> Evidence:
+    """What one look says, as far as it is new.
 
     Args:
       weight: share of the look that is new evidence, see `core.novelty`.
     """
     fusion, nobody = models.fusion, jnp.zeros(len(models.detectors), bool)
     alone = fusion.update(fusion.prior, nobody, features, modality, weight)
-    return jnp.log(fusion.class_probabilities(alone))
+    return Evidence(
+        log_likelihood=jnp.log(fusion.class_probabilities(alone)),
+        exact=weight * models.bayes.log_likelihoods(features, modality),
+    )

@@ -17,7 +17,7 @@ from jaxsense.core.networks import MLP
 from jaxsense.core.types import Belief
 from jaxsense.mission import act, maps
 from jaxsense.mission.begin import start
-from jaxsense.mission.maps import MOST_LOOKS, Change, Evidence, OwnMap, SharedMap
+from jaxsense.mission.maps import MOST_LOOKS, Evidence, OwnMap
 from jaxsense.mission.rollout import _repeat_messages, rollout_batch
 from jaxsense.mission.state import FAILED
 from jaxsense.vae import readout
@@ -149,39 +149,33 @@ def test_a_full_memory_takes_nothing_more():
 def test_looks_one_by_one_come_to_the_shared_map(own_models):
     """To rounding: the least probability is far below these."""
     fusion, held = own_models.fusion, maps.empty(MODALITY, 3)
-    tiled = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), fusion.prior)
-    prior = jnp.tile(own_models.bayes.prior, (2, 1))
-    nowhere = jnp.full((2, 2, 1, 2), jnp.inf)
-    shared = SharedMap(tiled, prior, jnp.zeros((2, 2), jnp.int32), nowhere)
-    rng = np.random.default_rng(0)
+    shared = jax.tree.map(lambda x: jnp.tile(x, (2, 1)), (fusion.prior, own_models.bayes.prior))
+    nobody, rng = jnp.zeros(2, bool), np.random.default_rng(0)
 
-    @functools.partial(jax.jit, static_argnums=3)
-    def learn(shared, held, features, modality, weight):
-        args = own_models, jnp.int32(1), features, modality, weight
-        found = shared.learn(*args)
-        return found, OwnMap(held, held.taken(), 2).learn(*args)
+    @functools.partial(jax.jit, static_argnums=2)
+    def learn(shared, features, modality, weight):
+        """What one more look at PoI 1 changes in the shared map, and its evidence."""
+        look = features, modality, weight
+        belief, log_posterior = jax.tree.map(lambda x: x[1], shared)
+        new = fusion.update(belief, nobody, *look), own_models.bayes.update(log_posterior, *look)
+        after = jax.tree.map(lambda x, new: x.at[1].set(new), shared, new)
+        return after, maps.evidence_of(own_models, *look)
 
+    read = jax.jit(lambda held: OwnMap(held, held.taken(), 2).read(own_models))
     for look in range(6):
         modality, weight = look % 2, np.float32(rng.uniform(0.3, 1.0))
         features = np.float32(rng.dirichlet([1.0, 1.0]))
-        found, own = learn(shared, held, features, modality, weight)
-        np.testing.assert_allclose(own.belief.mean, found.belief.mean, atol=2e-4)
-        np.testing.assert_allclose(own.belief.std, found.belief.std, atol=2e-4)
-        np.testing.assert_allclose(own.log_posterior, found.log_posterior, atol=1e-5)
-        shared = replace(
-            shared,
-            belief=jax.tree.map(lambda x, new: x.at[1].set(new), shared.belief, found.belief),
-            log_posterior=shared.log_posterior.at[1].set(found.log_posterior),
-        )
-        assert own.evidence is not None
-        held = looked(held, modality, poi=1, evidence=own.evidence)
-    assert np.abs(shared.belief.mean).max() > 0.3
-    # The map of a robot that knows all of them is the same; PoI 0 has not been looked at.
-    read = OwnMap(held, held.taken(), 2).read(own_models)
-    np.testing.assert_allclose(read.belief.mean, shared.belief.mean, atol=2e-4)
-    np.testing.assert_array_equal(read.belief.std[0], fusion.prior.std)
-    np.testing.assert_allclose(read.log_posterior, shared.log_posterior, atol=1e-5)
-    np.testing.assert_array_equal(read.times_seen, [[0, 0], [3, 3]])
+        shared, evidence = learn(shared, features, modality, weight)
+        belief, log_posterior = shared
+        held = looked(held, modality, poi=1, evidence=evidence)
+        # The map of a robot that knows all looks is the same; PoI 0 has not been looked at.
+        own = read(held)
+        np.testing.assert_allclose(own.belief.mean, belief.mean, atol=2e-4)
+        np.testing.assert_allclose(own.belief.std, belief.std, atol=2e-4)
+        np.testing.assert_array_equal(own.belief.std[0], fusion.prior.std)
+        np.testing.assert_allclose(own.log_posterior, log_posterior, atol=1e-5)
+    assert np.abs(shared[0].mean).max() > 0.3
+    np.testing.assert_array_equal(read(held).times_seen, [[0, 0], [3, 3]])
 
 
 def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
@@ -198,15 +192,15 @@ def test_robots_that_work_repeat_their_messages(own_team, own_arena, set_robot):
 
 def test_a_robot_remembers_and_tells_what_it_has_detected(own_team, own_arena, set_robot):
     state = set_robot(own_arena(POSITIONS, POSES), 1, target=2)
-    learned = Change(Belief(*jnp.ones((2, 2))), jnp.zeros(3), NOTHING)
+    learned = (Belief(*jnp.ones((2, 2))), jnp.zeros(3)), NOTHING
     write = jax.jit(lambda state, *found: act._write(own_team, 1, jax.random.key(0), state, *found))
-    after = write(replace(state, steps=jnp.int32(4)), jnp.bool_(True), learned).memory
+    after = write(replace(state, steps=jnp.int32(4)), jnp.bool_(True), *learned).memory
     np.testing.assert_array_equal(after.number, [0, 1])
     assert after.poi[1, 0] == 2
     np.testing.assert_allclose(after.place[1, 0], POSES[1][:2])
     # Both at once; of the other robot nobody has heard anything.
     np.testing.assert_allclose(after.heard_at[:, :, 0], [[np.inf, 0.4]] * 2, rtol=1e-6)
-    missed = write(state, jnp.bool_(False), learned).memory
+    missed = write(state, jnp.bool_(False), *learned).memory
     jax.tree.map(np.testing.assert_array_equal, missed, state.memory)
 
 
