@@ -8,7 +8,6 @@ from typing import TypeAlias, TypeVar
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree, Shaped
-from mujoco import mjx
 
 from jaxsense.config.mission import CONTROL_PERIOD, Search
 from jaxsense.core.types import Belief, Index, Key, call, others, pytree
@@ -179,11 +178,10 @@ def scan(
     def scanned(rows: tuple[Key, MissionState], _) -> dict[str, PyTree]:
         keys, states = rows
         keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-        aims = jax.vmap(functools.partial(_aim, mission, models, robot))(keys[0], states)
 
         def look(i: int) -> tuple[Bool[Array, " S"], _Held, Evidence | None]:
             alone = functools.partial(_look, mission, models, robot, carried[i])
-            return jax.vmap(alone)(keys[1], states, aims)
+            return jax.vmap(alone)(keys[0], keys[1], states)
 
         # The choice of the sensor outside the batch: inside, all would scan.
         found = call(look, which, len(carried))
@@ -209,33 +207,10 @@ def _scans(me: Robot) -> Bool[Array, ""]:
     return (own.phase == FACING) & is_aligned & is_calm & ((room[0] > 0) | waits)
 
 
-@pytree
-class _Aim:
-    """The arena, at which bearing [rad] and distance [m] a robot believes its target, and novelty.
-
-    Attributes:
-      weight: share of the look that is new evidence.
-    """
-
-    placed: mjx.Data
-    bearing: Float[Array, ""]
-    distance: Float[Array, ""]
-    weight: Float[Array, ""]
-
-
-@jax.named_scope("mission.aim")
-def _aim(mission: Mission, models: Models, robot: Index, key: Key, state: MissionState) -> _Aim:
-    """How a robot looks, with any sensor."""
-    me, scene = Robot(mission, state, robot), state.scene
-    error = jnp.radians(mission.config.viewpoint.bearing_error)
-    error = jax.random.uniform(key, (), minval=-error, maxval=error)
-    apart = me.map.apart(me.pose[None, :2], me.target, me.modality)[0]
-    return _Aim(
-        placed=arenas.place(mission.world.arena, scene.layout, scene.poses),
-        bearing=_bearing(me) + error,
-        distance=jnp.linalg.norm(scene.layout.position[me.target] - me.pose[:2]),
-        weight=models.novelty.weight(apart, me.modality),
-    )
+def _looks_at(key: Key, me: Robot) -> Float[Array, ""]:
+    """Bearing at which a robot looks at its target, with a random error, in radians."""
+    error = jnp.radians(me.mission.config.viewpoint.bearing_error)
+    return _bearing(me) + jax.random.uniform(key, (), minval=-error, maxval=error)
 
 
 @jax.named_scope("mission.look")
@@ -244,9 +219,9 @@ def _look(
     models: Models,
     robot: Index,
     modality: int,
-    key: Key,
+    bearing_key: Key,
+    scan_key: Key,
     state: MissionState,
-    aim: _Aim,
 ) -> tuple[Bool[Array, ""], _Held, Evidence | None]:
     """Whether a scan detects its PoI with enough confidence, and what it would change.
 
@@ -254,18 +229,22 @@ def _look(
       Whether it detects it, what the map of all looks would say of it, and what the robot would
       remember of the look: None where all robots share a map.
     """
-    config, sensor, bearing = mission.config, mission.world.sensors[modality], aim.bearing
+    config, sensor = mission.config, mission.world.sensors[modality]
+    me, scene = Robot(mission, state, robot), state.scene
+    bearing = _looks_at(bearing_key, me)
+    distance = jnp.linalg.norm(scene.layout.position[me.target] - me.pose[:2])
+    placed = arenas.place(mission.world.arena, scene.layout, scene.poses)
     search = Search(*config.mission.localisation.search)
     wide = tuple(windows.widened(each, search) for each in mission.world.sensors)
     world = dataclasses.replace(mission.world, sensors=wide)
     readings = worlds.scan_around(
-        key, world, state.scene, aim.placed, robot, bearing, modality, state.time
+        scan_key, world, scene, placed, robot, bearing, modality, state.time
     )
     readings = jnp.where(state.time >= state.faults.blind_at[robot], sensor.blind, readings)
-    found = models.detect_in_window(modality, sensor, readings, bearing, aim.distance, search)
+    found = models.detect_in_window(modality, sensor, readings, bearing, distance, search)
     is_confident = jnp.max(found.features) >= config.mission.least_confidence
-    me = Robot(mission, state, robot)
-    look = found.features, modality, aim.weight
+    apart = me.map.apart(me.pose[None, :2], me.target, me.modality)[0]
+    look = found.features, modality, models.novelty.weight(apart, me.modality)
     before = state.belief, state.seen, state.log_posterior
     belief, seen, log_posterior = jax.tree.map(lambda rows: rows[me.target], before)
     held = models.fusion.update(belief, seen, *look), models.bayes.update(log_posterior, *look)

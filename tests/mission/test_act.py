@@ -20,6 +20,7 @@ from jaxsense.mission.state import (
     IDLE,
     RECENT_LOOKS,
     Faults,
+    Robot,
 )
 
 CAMERA, LIDAR = 0, 1
@@ -143,8 +144,8 @@ def test_only_a_robot_that_faces_the_poi_and_is_calm_scans(
     assert after.robots.looks[CAMERA] == scans
 
 
-def test_a_robot_turns_to_either_side_of_its_target(team, models, facing):
-    bearing = lambda key, state: act._aim(team, models, CAMERA, key, state).bearing  # noqa: E731
+def test_a_robot_turns_to_either_side_of_its_target(team, facing):
+    bearing = lambda key, state: act._looks_at(key, Robot(team, state, CAMERA))  # noqa: E731
     keys = jax.random.split(jax.random.key(0), 100)
     shares = jax.jit(jax.vmap(bearing, (0, None)))(keys, facing(CAMERA)) / np.radians(
         CONFIG.viewpoint.bearing_error
