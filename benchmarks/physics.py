@@ -53,6 +53,9 @@ class Drives:
     wheel_speeds: jax.Array
 
 
+Played: TypeAlias = tuple[MissionState, jax.Array]
+"""States, and the commands that the robots want."""
+
 Sides: TypeAlias = Callable[[Arena, Drives], list[Side]]
 """A peer's ways to make the steps of drives, each of which returns the last poses first."""
 
@@ -191,8 +194,8 @@ def _free_drives(options: Options) -> tuple[Arena, list[Drives]]:
     return arena, [_random_drives(key, _UNTRAINED, batch, steps) for batch in batches]
 
 
-def _mid_mission(options: Options) -> tuple[Mission, list[MissionState]]:
-    """States `[B, P]` of missions under way, for each size of a batch."""
+def _mid_mission(options: Options) -> tuple[Mission, list[Played]]:
+    """Inputs `[B, P]` of the physics in missions under way, for each size of a batch."""
     batches = measure.batches(options, quick=16, cpu=(64, 384), accelerator=(8192, 65536))
     scenario, states = _played(batches[-1], periods=2 if options.quick else 8)
     return scenario, [jax.tree.map(lambda x: x[:batch], states) for batch in batches]  # noqa: B023
@@ -219,21 +222,20 @@ def _random_drives(key: jax.Array, config: Config, batch: int, steps: int) -> Dr
 
 
 @functools.cache
-def _played(batch: int, periods: int) -> tuple[Mission, MissionState]:
-    """`[B, P]` states that the physics was given in P successive periods of naive missions."""
+def _played(batch: int, periods: int) -> tuple[Mission, Played]:
+    """`[B, P]` inputs of the physics in P successive periods of naive missions."""
     scenario = mission.make_mission(_UNTRAINED)
     networks = init(jax.random.key(0), scenario.config)
 
-    def play(keys: jax.Array) -> MissionState:
+    def play(keys: jax.Array) -> Played:
         reset_keys, play_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
         naive = scenario.policy("naive")
         states = jax.vmap(lambda key: mission.reset(key, scenario, networks, naive))(reset_keys)
 
         def step(states: MissionState, keys: jax.Array):
             after, _ = mission_step(keys, scenario, networks, states)
-            # What the robots decided in this period, from where they stood before it.
-            robots = dataclasses.replace(states.robots, wanted=after.robots.wanted)
-            return after, dataclasses.replace(states, robots=robots)
+            # The ramp towards the command at the period's end is that towards the wanted one.
+            return after, (states, after.robots.command)
 
         def skip(states: MissionState, keys: jax.Array):
             return step(states, keys)[0], None
@@ -251,10 +253,10 @@ def _played(batch: int, periods: int) -> tuple[Mission, MissionState]:
     return scenario, jax.tree.map(lambda x: x[rows], played)
 
 
-def _as_drives(states: MissionState) -> Drives:
+def _as_drives(played: Played) -> Drives:
     """`[B * P]` drives, each of one control period, with the commands that `move` gives."""
     substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
-    flat: MissionState = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
+    flat, wanted = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), played)
 
     def ramp(command: jax.Array, wanted: jax.Array) -> jax.Array:
         def substep(command: jax.Array, _):
@@ -268,7 +270,7 @@ def _as_drives(states: MissionState) -> Drives:
         poses=flat.scene.poses,
         velocity=flat.velocity,
         warmstart=flat.warmstart,
-        wheel_speeds=jax.jit(jax.vmap(ramp))(flat.robots.command, flat.robots.wanted),
+        wheel_speeds=jax.jit(jax.vmap(ramp))(flat.robots.command, wanted),
     )
 
 
@@ -301,20 +303,20 @@ def _drive_side(arena: Arena, drives: Drives, workers: Workers, keeps_data: bool
     )
 
 
-def _move_side(scenario: Mission, states: MissionState) -> Side:
+def _move_side(scenario: Mission, played: Played) -> Side:
     """Our physics as the mission calls it, one period after the other, on all devices."""
 
-    def periods(states: MissionState) -> tuple[jax.Array, jax.Array]:
-        by_period = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), states)
-        moved = jax.lax.map(lambda states: move(scenario, states), by_period)
+    def periods(played: Played) -> tuple[jax.Array, jax.Array]:
+        by_period = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), played)
+        moved = jax.lax.map(lambda period: move(scenario, *period), by_period)
         poses, velocity = moved.scene.poses, moved.velocity
         return tuple(jnp.swapaxes(x, 0, 1) for x in (poses, velocity))  # pyright: ignore
 
-    batch, number = states.steps.shape
+    batch, number = played[0].steps.shape
     substeps = round(CONTROL_PERIOD / arenas.TIMESTEP)
     work = batch * number * substeps
     workers = devices.start(None)
-    return measure.compiled(periods, states, work=work, batch=batch, workers=workers)
+    return measure.compiled(periods, played, work=work, batch=batch, workers=workers)
 
 
 def _native_sides(

@@ -134,7 +134,6 @@ def _idle_robots(num_robots: int, paths: Roadmap) -> Robots:
         view=number,
         to_view=jnp.zeros((num_robots, num_nodes)),
         command=jnp.zeros((num_robots, 2)),
-        wanted=jnp.zeros((num_robots, 2)),
         decided_on=number,
         excluded=jnp.zeros((num_robots, num_views + 1), bool),
         attempts=number,

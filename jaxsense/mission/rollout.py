@@ -92,8 +92,7 @@ def step(
     # All robots at once: nothing that they do here changes where the others are.
     steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
     wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
-    states = dataclasses.replace(states, robots=dataclasses.replace(states.robots, wanted=wanted))
-    states = _drift(drift_keys, mission, before, move(mission, states))
+    states = _drift(drift_keys, mission, before, move(mission, states, wanted))
     is_idle, steps = jnp.all(states.robots.phase >= ENDED, axis=-1), states.steps + 1
     is_late = steps * CONTROL_PERIOD >= mission.config.mission.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
@@ -179,17 +178,20 @@ class _Motion:
 
 
 @jax.named_scope("mission.move")
-def move(mission: Mission, states: MissionState) -> MissionState:
+def move(mission: Mission, states: MissionState, wanted: Float[Array, "B R 2"]) -> MissionState:
     """Simulates one control period of B missions side by side.
 
     Contacts cost several times as much as everything else, and the planner avoids them. All robots
     move in an empty arena, and once more among PoIs and walls in the missions where one can touch
     anything within the period. In the others, both would result in the same motion.
+
+    Args:
+      wanted: speeds that the robots want, see `act.steer`.
     """
     robots, layout, poses = states.robots, states.scene.layout, states.scene.poses
     motion = _Motion(poses, states.velocity, states.warmstart, robots.command)
     is_near = _is_near(mission.config, layout, poses) & ~states.done
-    inputs = motion, robots.wanted, layout
+    inputs = motion, wanted, layout
     free = _integrate(mission, mission.free_arena, *inputs)
     among = lambda rows, _: _integrate(mission, mission.world.arena, *rows)  # noqa: E731
     motion, clearance = where_due(is_near, among, free, inputs)

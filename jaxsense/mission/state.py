@@ -71,7 +71,6 @@ class Robots:
     view: Int[Array, " R"]
     to_view: Float[Array, "R K"]
     command: Float[Array, "R 2"]
-    wanted: Float[Array, "R 2"]
     decided_on: Int[Array, " R"]
     excluded: Bool[Array, "R V+1"]
     attempts: Int[Array, " R"]
@@ -136,11 +135,6 @@ class MissionState:
     def seen(self) -> Bool[Array, "... N M"]:
         """Which modalities have detected which PoI."""
         return self.times_seen > 0
-
-    @property
-    def version(self) -> Int[Array, "..."]:
-        """Version of the map of all looks: their number."""
-        return jnp.sum(self.times_seen, axis=(-2, -1))
 
     @property
     def time(self) -> Float[Array, "..."]:

@@ -226,4 +226,6 @@ def test_without_losses_and_delay_missions_are_those_of_a_shared_map(team, own_m
     np.testing.assert_allclose(own_records.poses, records.poses, atol=1e-4)
     np.testing.assert_allclose(own_records.belief.mean, records.belief.mean, atol=1e-3)
     assert own_end.memory is not None
-    np.testing.assert_array_equal(own_end.memory.number.sum(axis=1), end.version)
+    np.testing.assert_array_equal(
+        own_end.memory.number.sum(axis=1), end.times_seen.sum(axis=(1, 2))
+    )

@@ -24,7 +24,7 @@ def pushing(arena_of, set_robot):
             x = 0.8 - CONFIG.arena.poi_radius - amiro.BODY_RADIUS - gap
             state = arena_of(AHEAD, [[x, 0.0, 0.0], [0.0, 1.2, 0.0]], classes=(0, 1, 2))
             speed = jnp.array([amiro.MAX_SPEED, 0.0])
-            states.append(set_robot(state, 0, command=speed, wanted=speed))
+            states.append(set_robot(state, 0, command=speed))
         return jax.tree.map(lambda *x: jnp.stack(x), *states)
 
     return make
@@ -39,7 +39,7 @@ def move(team):
         model = team.free_arena.model
         model = model.replace(actuator_gainprm=pull * model.actuator_gainprm)
         weaker = replace(team, free_arena=replace(team.free_arena, model=model))
-        return move_all(weaker, states)
+        return move_all(weaker, states, states.robots.command)
 
     return lambda states, pull=1.0: of_three(states, jnp.float32(pull))
 
@@ -66,7 +66,7 @@ def test_periods_of_contact_are_counted(team, pushing, monkeypatch):
     clearance = lambda *given: (given[2], given[2].poses[:, 0, 0] - 0.6)  # noqa: E731
     monkeypatch.setitem(_is_near.__globals__, "_integrate", clearance)
     before = replace(pushing(0.03, 0.1), contacts=jnp.array([2, 2], jnp.int32))
-    after = jax.jit(lambda states: move_all(team, states))(before)
+    after = jax.jit(lambda states: move_all(team, states, states.robots.command))(before)
     np.testing.assert_array_equal(after.contacts, [2, 3])
 
 
@@ -74,7 +74,10 @@ def test_periods_of_contact_are_counted(team, pushing, monkeypatch):
 def test_contacts_hold_a_robot_back_where_there_are_any(move, pushing):
     free = mission.make_mission(CONFIG, contacts=False)
     ends, start = {}, pushing(0.002, 0.002, 0.002)
-    for name, each in (("contacts", move), ("free", jax.jit(lambda s: move_all(free, s)))):
+    for name, each in (
+        ("contacts", move),
+        ("free", jax.jit(lambda s: move_all(free, s, s.robots.command))),
+    ):
         state = start
         for _ in range(5):
             state = each(state)

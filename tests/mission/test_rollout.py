@@ -161,7 +161,7 @@ def test_the_map_changes_where_something_was_detected_and_nowhere_else(healthy):
     wrote = record.detected.any(axis=-1)
     changed = np.any(np.diff(record.belief.mean, axis=1) != 0, axis=(-1, -2))
     np.testing.assert_array_equal(changed, wrote[:, 1:])
-    np.testing.assert_array_equal(end.version, record.detected.sum(axis=(1, 2)))
+    np.testing.assert_array_equal(end.times_seen.sum(axis=(1, 2)), record.detected.sum(axis=(1, 2)))
     assert np.all(np.diff(record.seen.astype(int), axis=1) >= 0)
 
 
