@@ -76,30 +76,27 @@ def start(
     classes: Int[Array, " N"],
     policy: Int[Array, ""],
     faults: Faults,
-    paths: Roadmap | None = None,
-    pose_error: Float[Array, "R 3"] | None = None,
+    paths: Roadmap,
+    pose_error: Float[Array, "R 3"],
 ) -> MissionState:
     """Starts a mission in a given arena with an empty map.
 
     Args:
-      paths: roadmap of the layout; computed by default.
-      pose_error: errors of localisation, see `localisation.draw`; none by default.
+      paths: roadmap of the layout.
+      pose_error: errors of localisation, see `localisation.draw`.
     """
     config = mission.config
     num_robots, num_pois = len(config.carried), config.arena.num_pois
     num_classes = len(config.arena.classes)
     chex.assert_shape(classes, (num_pois,))
-    chex.assert_shape(scene.poses, (num_robots, 3))
+    chex.assert_shape([scene.poses, pose_error], (num_robots, 3))
     chex.assert_shape([faults.stops_at, faults.blind_at], (num_robots,))
     checks.require_index("classes", classes, num_classes)
     checks.require_index("policy", policy, len(mission.policies))
     for name, times in vars(faults).items():
         expected = "must be seconds, infinite for never"
         checks.require(f"faults.{name}", times, lambda x: x >= 0, expected)
-    paths = roadmap.build(config, scene.layout) if paths is None else paths
     own_maps = config.mission.communication.own_maps
-    pose_error = jnp.zeros((num_robots, 3)) if pose_error is None else pose_error
-    chex.assert_shape(pose_error, (num_robots, 3))
     return MissionState(
         scene=scene,
         pose_error=pose_error,

@@ -40,7 +40,8 @@ def starting(team, models):
         layout = sim.make_layout(team.config.arena, positions, yaw, classes)
         light = Light(jnp.array([0.6, 0.0, 0.8]), jnp.float32(0.5), jnp.float32(0.5))
         scene = sim.Scene(layout, light, poses)
-        return begin.start(team, models, scene, classes, policy, faults)
+        paths, no_error = mission.roadmap.build(team.config, layout), jnp.zeros_like(poses)
+        return begin.start(team, models, scene, classes, policy, faults, paths, no_error)
 
     def make(positions, poses, classes=(0, 1, 2), policy=NAIVE, faults=None):
         positions, poses = (np.array(x, np.float32) for x in (positions, poses))

@@ -63,10 +63,8 @@ def own_arena(own_team, own_models, arena_of):
 
     def make(positions, poses, policy=LATENT):
         state = arena_of(positions, poses, classes=(2, 0, 1), policy=policy)
-        return start(
-            *(own_team, own_models, state.scene, state.classes, state.policy, state.faults),
-            paths=state.roadmap,
-        )
+        given = state.scene, state.classes, state.policy, state.faults
+        return start(own_team, own_models, *given, state.roadmap, state.pose_error)
 
     return make
 
