@@ -6,7 +6,6 @@ import hashlib
 import os
 import re
 import secrets
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,6 +20,7 @@ from jaxsense.config import ConfigError
 from jaxsense.core import inside
 from jaxsense.core.types import by_place, placed
 from jaxsense.run.monitor import is_finite
+from jaxsense.run.output import complain
 
 T = TypeVar("T")
 
@@ -146,18 +146,9 @@ class Checkpoints:
       path: the directory.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        warn: Callable[[str], None] = lambda text: print(text, file=sys.stderr),
-    ):
-        """Opens a directory, which need not exist.
-
-        Args:
-          path: the directory.
-          warn: receives a line about each damaged checkpoint.
-        """
-        self.path, self._warn = path, warn
+    def __init__(self, path: Path):
+        """Opens a directory, which need not exist."""
+        self.path = path
 
     def save(self, name: str, tree: PyTree) -> None:
         """Saves a pytree of arrays; raises `OSError` if the file cannot be written."""
@@ -207,7 +198,7 @@ class Checkpoints:
             return self.load(name, shapes, finite)
         except ConfigError as error:
             file.replace(file.with_name(f"{file.name}.damaged"))
-            self._warn(f"{error}; retraining it")
+            complain(f"{error}; retraining it")
             return None
 
     def forget_unfinished(self, stages: Iterable[str]) -> None:

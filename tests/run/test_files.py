@@ -121,9 +121,8 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage):
-    said = []
-    checkpoints = Checkpoints(tmp_path, said.append)
+def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage, capsys):
+    checkpoints = Checkpoints(tmp_path)
     checkpoints.save("tree", TREE)
     file = tmp_path / "tree.msgpack"
     content = file.read_bytes()
@@ -133,13 +132,13 @@ def test_every_damage_is_noticed_and_named_and_put_aside(tmp_path, damage):
         with pytest.raises(ConfigError, match=r"tree.msgpack': is damaged"):
             checkpoints.load("tree", SHAPES)
     assert checkpoints.load_or_forget("tree", SHAPES) is None
-    (line,) = said
+    (line,) = capsys.readouterr().err.splitlines()
     assert "tree.msgpack': is damaged" in line
     assert line.endswith("retraining it")
     assert (tmp_path / "tree.msgpack.damaged").read_bytes() == damaged
     checkpoints.save("tree", TREE)
     assert checkpoints.load_or_forget("tree", SHAPES) is not None
-    assert len(said) == 1
+    assert not capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -157,8 +156,8 @@ def test_a_checkpoint_of_other_shapes_is_named(tmp_path, shapes, expected):
         checkpoints.load("tree", shapes)
 
 
-def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path):
-    checkpoints, name = Checkpoints(tmp_path, pytest.fail), f"{UNFINISHED}/jmvae"
+def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_path, capsys):
+    checkpoints, name = Checkpoints(tmp_path), f"{UNFINISHED}/jmvae"
     state = [FitState({"w": np.ones(2, np.float32)}, (np.int32(3),), np.int32(7), np.float32(0.5))]
     checkpoints.save(name, state)
     checkpoints.save("tree", TREE)
@@ -174,3 +173,4 @@ def test_a_training_under_way_comes_back_and_is_forgotten_when_it_is_over(tmp_pa
     assert not (tmp_path / "unfinished").exists()
     assert checkpoints.load_or_forget(name, state) is None
     assert checkpoints.load("tree", SHAPES) is not None
+    assert not capsys.readouterr().err
