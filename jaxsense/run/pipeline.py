@@ -21,7 +21,7 @@ from jaxsense.sim import sensors
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
 from jaxsense.training.agents import learner, learners
-from jaxsense.training.stage import Output, Progress, Stage
+from jaxsense.training.stage import Output, Progress, Stage, key_of
 
 Curves = dict[str, np.ndarray]
 """`[steps]` of each metric of a training, and `[chunks]` `seconds`; NaN where it has not been."""
@@ -109,7 +109,7 @@ def play(
     settings = programs.config.mission
     cases = mission.cases(programs.config, player.mission.policies)
     of_run = {name: cases[name] for name in settings.policies}
-    played = player.play(stages.mission_key(key), learned.models, of_run, settings.episodes)
+    played = player.play(key_of(key, "mission"), learned.models, of_run, settings.episodes)
     checkpoints.forget_unfinished(stage.name for stage in programs.stages)
     return played, make.missions(programs.config, played.metrics)
 

@@ -23,7 +23,6 @@ from jaxsense.training.stage import (
     Progress,
     Stage,
     is_finite,
-    key_of,
     restarts,
     scan,
 )
@@ -170,8 +169,3 @@ def sources(config: Config) -> dict[str, str | tuple[str, ...]]:
 def models(outputs: Mapping[str, Output], config: Config) -> Models:
     """Collects the models from the outputs of all stages, by name."""
     return make_models(config, **jax.tree.map(outputs.__getitem__, sources(config)))
-
-
-def mission_key(key: Key) -> Key:
-    """Key of the missions that follow a training with this key."""
-    return key_of(key, "mission")

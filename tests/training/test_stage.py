@@ -15,8 +15,7 @@ from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.programs import Programs
 from jaxsense.training import learn
-from jaxsense.training.stage import Progress, Stage, scan
-from jaxsense.training.stages import mission_key
+from jaxsense.training.stage import Progress, Stage, key_of, scan
 
 
 @pytest.mark.parametrize(
@@ -42,7 +41,7 @@ def test_keys_follow_from_the_names_of_stages_alone():
         for c in (TINY, more)
     )
     assert all(many[name] == keys for name, keys in few.items())
-    used = [key for keys in few.values() for key in keys] + data([mission_key(KEY)])
+    used = [key for keys in few.values() for key in keys] + data([key_of(KEY, "mission")])
     assert len(set(used)) == len(used)
 
 
