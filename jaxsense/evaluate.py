@@ -162,8 +162,7 @@ def _report(run: Path, config: Config) -> Path:
 
 def _place(config: Config) -> str:
     """Short name of an arena and its robots, for file names."""
-    numbers = {modality: config.carried.count(modality) for modality in config.carried}
-    robots = "-".join(f"{number}-{modality}" for modality, number in numbers.items())
+    robots = tables.counted(config.carried).replace(", ", "-").replace(" ", "-")
     return f"{config.arena.num_pois}-points-{config.arena.side:g}-m-{robots}"
 
 
