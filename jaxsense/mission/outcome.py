@@ -130,7 +130,6 @@ def measure(mission: Mission, models: Models, state: MissionState) -> dict[str, 
       `collisions`: `[]` int32 control periods with contact.
       `goals`, `goals_reached`: `[]` int32, of all robots.
       `information`: `[]` sum over the map.
-      `detections`: `[R]` int32.
       `reason`: `[]` int32, see `reason`.
     """
     config = mission.config
