@@ -17,8 +17,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
 from jaxsense.run import cli, devices, version
-from jaxsense.run.compilation import shapes_of, trace
 from jaxsense.run.devices import Workers
+from jaxsense.run.kept import shapes_of, trace
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "numpy")
 

@@ -11,8 +11,8 @@ import jax
 
 from jaxsense.config import Config, ConfigError, options
 from jaxsense.config.section import require_32_bits
-from jaxsense.run.compilation import Kept, use_cache
 from jaxsense.run.files import WriteError
+from jaxsense.run.kept import Kept, use_cache
 from jaxsense.run.monitor import StageError
 from jaxsense.run.output import complain, tell
 

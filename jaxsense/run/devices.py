@@ -198,7 +198,7 @@ def spread(
 
     Args:
       function: of pytrees of arrays, whose first axis is a batch of independent rows. With MJX
-        inside, it must be one that `compilation.trace` returns: jaxlib 0.11.2 crashes while it
+        inside, it must be one that `kept.trace` returns: jaxlib 0.11.2 crashes while it
         compiles a step of MJX whose constants `shard_map` sees, on a CPU and on accelerators.
       mesh: from `make_mesh`; its size must divide the batch.
       number: of arguments.

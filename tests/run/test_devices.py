@@ -16,8 +16,9 @@ from smoke import SMOKE, error_line, without_times
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices
-from jaxsense.run.compilation import Compiler, Kept, Program, RowProgram, trace
+from jaxsense.run.compilation import Compiler, Program, RowProgram
 from jaxsense.run.devices import Workers
+from jaxsense.run.kept import Kept, trace
 from jaxsense.run.monitor import Monitor
 from jaxsense.sim import arena as arenas
 
@@ -95,7 +96,7 @@ from pathlib import Path
 import jax
 import scipy.stats  # whose import filters warnings
 import jaxsense
-from jaxsense.run import compilation, devices
+from jaxsense.run import devices, kept
 
 def state():
     return dict(os.environ), dict(jax.config.values), gc.get_threshold(), warnings.filters[:]
@@ -103,7 +104,7 @@ def state():
 before = state()
 devices.threads()
 devices.compiler_options()
-compilation.Kept(Path(sys.argv[1]))
+kept.Kept(Path(sys.argv[1]))
 task = jaxsense.make("map-v0", "camera")
 jaxsense.score(task, lambda key, observation: jax.numpy.int32(3), episodes=2)
 jaxsense.load_pretrained("noisy")

@@ -17,8 +17,9 @@ from flax import struct
 import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
-from jaxsense.run import cli, compilation, version
-from jaxsense.run.compilation import Compiler, Kept, Program
+from jaxsense.run import cli, version
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.kept import _MAX_BYTES, Kept, use_cache
 from jaxsense.run.monitor import Monitor
 
 ONE = jnp.float32(1)
@@ -136,7 +137,8 @@ FACTORS = """
 import sys
 from pathlib import Path
 import jax, jax.numpy as jnp
-from jaxsense.run.compilation import Compiler, Kept, Program
+from jaxsense.run.compilation import Compiler, Program
+from jaxsense.run.kept import Kept
 from jaxsense.run.monitor import Monitor
 
 kept = Kept(Path(sys.argv[1]))
@@ -182,7 +184,7 @@ def test_the_oldest_programs_are_forgotten_and_no_other_file(tmp_path, monkeypat
     left.write_text("{", encoding="utf-8")
     link = kept.path / f"stage-{32 * '1'}.stablehlo"
     link.symlink_to(theirs[0])
-    monkeypatch.setattr(compilation, "_MAX_KEPT", 2)
+    monkeypatch.setattr("jaxsense.run.kept._MAX_KEPT", 2)
     Kept(tmp_path)
     assert [path.exists() for path in paths] == [True, False, False, True]
     assert all(path.exists() for path in (*theirs, link))
@@ -230,16 +232,16 @@ def test_all_compiled_programs_are_cached(tmp_path):
     before = [jax.config.values[name] for name in names]
     try:
         jax.config.update(names[0], None)
-        compilation.use_cache(tmp_path)
+        use_cache(tmp_path)
         found = [jax.config.values[name] for name in names]
     finally:
         for name, value in zip(names, before, strict=True):
             jax.config.update(name, value)
-    assert found == [str(tmp_path / "compiled"), compilation._MAX_BYTES, 0, -1]
+    assert found == [str(tmp_path / "compiled"), _MAX_BYTES, 0, -1]
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="has no users")
-@pytest.mark.parametrize(("name", "begin"), [("compiled", compilation.use_cache), ("traced", Kept)])
+@pytest.mark.parametrize(("name", "begin"), [("compiled", use_cache), ("traced", Kept)])
 def test_a_directory_of_others_is_refused(tmp_path, monkeypatch, name, begin):
     begin(tmp_path)
     match = f"{name} must be a directory that you own"
