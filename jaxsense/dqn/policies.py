@@ -9,14 +9,14 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsense.config import ConfigError
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Belief, Fusion, Key
+from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.team import Known, Team
+from jaxsense.dqn.team import Known
 
 _TAKEN = 1e2  # s, detour that a robot prefers to a PoI where another is heading
 
@@ -51,8 +51,11 @@ Values = Callable[[Key, Trained, Known], jax.Array]
 Gains = Callable[[Trained, Known], jax.Array]
 """`(models, known) -> [R, N]` gains of each robot's next look at each PoI; above 0 if it pays."""
 
-Rule = Callable[[jax.Array, jax.Array, Team, jax.Array], jax.Array]
-"""`(gains [R, N], times [R, N], team, robot) -> [N + 1]` values, see `nearest`."""
+Probabilities = Callable[[Trained, Known], jax.Array]
+"""`(models, known) -> [N, C]` probabilities of the classes of each PoI."""
+
+Rule = Callable[[jax.Array, Known], jax.Array]
+"""`(gains [R, N], known) -> [N + 1]` values, see `nearest`."""
 
 
 def table(own: Mapping[str, Values] | None = None) -> dict[str, Values]:
@@ -66,21 +69,6 @@ def table(own: Mapping[str, Values] | None = None) -> dict[str, Values]:
 def best(values: Float[Array, " A"]) -> Int[Array, ""]:
     """Action of the highest value, or -1 if any value is NaN."""
     return jnp.where(jnp.any(jnp.isnan(values)), -1, jnp.argmax(values)).astype(jnp.int32)
-
-
-def expected_gain(
-    fusion: Fusion,
-    look_values: tuple[LookValues, ...],
-    belief: Belief,
-    is_seen: Bool[Array, ""],
-) -> Float[Array, " M"]:
-    """Expected reward of each modality's next look at one PoI, given the map.
-
-    Args:
-      is_seen: whether anybody has looked at the PoI.
-    """
-    on_map = fusion.class_probabilities(belief)
-    return jnp.stack([values.of_next(on_map, is_seen) for values in look_values])
 
 
 def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
@@ -100,15 +88,24 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     return values[0] if len(values) == 1 else jnp.stack(values)[known.modality]
 
 
-def _by_exact_bayes(read: Callable[..., jax.Array]) -> Gains:
-    """Reads the values of looks at the exact posterior over the classes."""
+def _by_values(read: Callable[..., jax.Array], probabilities: Probabilities) -> Gains:
+    """Reads the values of looks at probabilities of the classes."""
 
     def gains(models: Trained, known: Known) -> jax.Array:
-        exact = jnp.exp(known.log_posterior)
-        found = [jax.vmap(read, (None, 0, 0))(x, exact, known.is_seen) for x in models.look_values]
+        of_pois, is_seen = probabilities(models, known), known.is_seen
+        found = [jax.vmap(read, (None, 0, 0))(x, of_pois, is_seen) for x in models.look_values]
         return jnp.stack(found)[known.team.modality]
 
     return gains
+
+
+def _exact_posterior(models: Trained, known: Known) -> jax.Array:
+    del models
+    return jnp.exp(known.log_posterior)
+
+
+def _on_map(models: Trained, known: Known) -> jax.Array:
+    return jax.vmap(models.fusion.class_probabilities)(known.belief)
 
 
 def _unexplored(number: int) -> Gains:
@@ -128,45 +125,30 @@ def random(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
     return jax.nn.one_hot(jax.random.randint(key, (), 0, number), number)
 
 
-def _on_map(models: Trained, known: Known) -> jax.Array:
-    """Expected gains on the map."""
-    gain = lambda belief, seen: expected_gain(models.fusion, models.look_values, belief, seen)  # noqa: E731
-    of_modality = jax.vmap(gain, out_axes=1)(known.belief, known.is_seen)
-    return of_modality[known.team.modality]
-
-
-def highest(
-    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
-) -> Float[Array, " A"]:
+def highest(gains: Float[Array, "R N"], known: Known) -> Float[Array, " A"]:
     """Rule that prefers the PoI with the highest expected gain."""
-    del times, team
-    return jnp.append(gains[agent], 0.0)
+    return jnp.append(gains[known.robot], 0.0)
 
 
-def nearest(
-    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
-) -> Float[Array, " A"]:
+def nearest(gains: Float[Array, "R N"], known: Known) -> Float[Array, " A"]:
     """Rule that prefers the nearest PoI with a positive expected gain.
+
+    PoIs that other robots head for come last.
 
     Args:
       gains: expected reward of each robot's look.
-      times: seconds until each robot has looked.
-      team: robots and PoIs at this moment; PoIs that other robots head for come last.
-      agent: the robot that chooses.
     """
-    return _with_nop(1 / (1 + _cost(times, team, agent)), _is_useful(gains, team)[agent])
+    return _with_nop(1 / (1 + _cost(known)), _is_useful(gains, known)[known.robot])
 
 
-def auction(
-    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
-) -> Float[Array, " A"]:
+def auction(gains: Float[Array, "R N"], known: Known) -> Float[Array, " A"]:
     """Rule that ranks the PoI won in a sequential auction first, the rest as `nearest` does.
 
     Each robot at work bids its travel time for each PoI with a positive expected gain. The lowest
     bid wins its PoI, robot and PoI leave, and so on (Koenig et al. 2006, sequential single-item
     auctions, with one item each).
     """
-    bids = jnp.where(_is_useful(gains, team) & team.works[:, None], times, jnp.inf)
+    bids = jnp.where(_is_useful(gains, known) & known.team.works[:, None], known.times, jnp.inf)
 
     def sell(_, carry):
         bids, won = carry
@@ -178,52 +160,47 @@ def auction(
 
     num_robots, num_pois = bids.shape
     nothing = jnp.full(num_robots, num_pois)
-    won = jax.lax.fori_loop(0, num_robots, sell, (bids, nothing))[1][agent]
+    won = jax.lax.fori_loop(0, num_robots, sell, (bids, nothing))[1][known.robot]
     # All other values are at most 1.
-    return nearest(gains, times, team, agent).at[won].add(jnp.where(won < num_pois, 1.0, 0.0))
+    return nearest(gains, known).at[won].add(jnp.where(won < num_pois, 1.0, 0.0))
 
 
-def gain_rate(
-    gains: Float[Array, "R N"], times: Float[Array, "R N"], team: Team, agent: Int[Array, ""]
-) -> Float[Array, " A"]:
+def gain_rate(gains: Float[Array, "R N"], known: Known) -> Float[Array, " A"]:
     """Rule that prefers the PoI with the highest expected gain for each second."""
-    return _with_nop(gains[agent] / _cost(times, team, agent), _is_useful(gains, team)[agent])
+    return _with_nop(gains[known.robot] / _cost(known), _is_useful(gains, known)[known.robot])
 
 
-def _is_useful(gains: jax.Array, team: Team) -> jax.Array:
-    return (gains > 0) & team.present[None]
+def _is_useful(gains: jax.Array, known: Known) -> jax.Array:
+    return (gains > 0) & known.team.present[None]
 
 
-def _cost(times: jax.Array, team: Team, agent: jax.Array) -> jax.Array:
-    return times[agent] + jnp.where(team.is_taken(agent), _TAKEN, 0.0)
+def _cost(known: Known) -> jax.Array:
+    return known.times[known.robot] + jnp.where(known.team.is_taken(known.robot), _TAKEN, 0.0)
 
 
 def _with_nop(values: jax.Array, is_useful: jax.Array) -> jax.Array:
     return jnp.append(jnp.where(is_useful, values, -1.0), 0.0)
 
 
-def _by_rule(rule: Rule, gains: Gains = _on_map) -> Values:
-    """A hand-written rule on expected gains and travel times, see `nearest`."""
+def _by_rule(rule: Rule, gains: Gains) -> Values:
+    """A hand-written rule on expected gains and travel times."""
+    return lambda key, models, known: rule(gains(models, known), known)
 
-    def values(key: Key, models: Trained, known: Known) -> jax.Array:
-        del key
-        return rule(gains(models, known), known.times, known.team, known.robot)
 
-    return values
-
+_GAINS_ON_MAP = _by_values(LookValues.of_next, _on_map)
 
 POLICIES: dict[str, Values] = {
     "latent": latent,
-    "greedy": _by_rule(highest),
-    "bayes": _by_rule(auction, _by_exact_bayes(LookValues.of_next)),
-    "optimal": _by_rule(auction, _by_exact_bayes(LookValues.of_all)),
+    "greedy": _by_rule(highest, _GAINS_ON_MAP),
+    "bayes": _by_rule(auction, _by_values(LookValues.of_next, _exact_posterior)),
+    "optimal": _by_rule(auction, _by_values(LookValues.of_all, _exact_posterior)),
     "naive": _by_rule(auction, _unexplored(1)),
     "naive_2": _by_rule(auction, _unexplored(2)),
     "naive_3": _by_rule(auction, _unexplored(3)),
     "random": random,
-    "nearest": _by_rule(nearest),
-    "auction": _by_rule(auction),
-    "rollout": _by_rule(gain_rate),
+    "nearest": _by_rule(nearest, _GAINS_ON_MAP),
+    "auction": _by_rule(auction, _GAINS_ON_MAP),
+    "rollout": _by_rule(gain_rate, _GAINS_ON_MAP),
 }
 """Built-in policies, by name.
 
@@ -233,7 +210,7 @@ the looks among the robots by an auction.
 """
 
 UNORDERED: dict[str, Values] = {
-    "optimal": _by_rule(highest, _by_exact_bayes(LookValues.of_all)),
+    "optimal": _by_rule(highest, _by_values(LookValues.of_all, _exact_posterior)),
     "naive": _by_rule(highest, _unexplored(1)),
 }
 """The same without travel times, for MDPs in which the order of looks does not matter."""

@@ -139,9 +139,10 @@ def test_a_policy_of_ones_own_is_one_more_entry():
 RULES = (policies.nearest, policies.auction, policies.gain_rate)
 
 
-def team(num_robots, num_pois=3, target=None, works=None, present=None):
-    """The places are of no importance to the policies."""
-    return Team(
+def known_by(agent, times, target=None, works=None, present=None):
+    """What a robot of a team knows; places and looks are of no importance to the rules."""
+    num_robots, num_pois = times.shape
+    team = Team(
         positions=jnp.zeros((num_pois, 2)),
         present=jnp.ones(num_pois, bool) if present is None else jnp.array(present, bool),
         poses=jnp.zeros((num_robots, 3)),
@@ -149,12 +150,14 @@ def team(num_robots, num_pois=3, target=None, works=None, present=None):
         works=jnp.ones(num_robots, bool) if works is None else jnp.array(works, bool),
         target=jnp.array([num_pois] * num_robots if target is None else target),
     )
+    known = known_of(UNKNOWN, np.zeros((num_pois, 2)))
+    return known.replace(team=team, times=times, robot=jnp.int32(agent))
 
 
 def choice(rule, gains, times, agent=0, **of_team):
     """The action of the highest value."""
     gains, times = jnp.array(gains, jnp.float32), jnp.array(times, jnp.float32)
-    values = jax.jit(rule)(gains, times, team(*gains.shape, **of_team), jnp.int32(agent))
+    values = jax.jit(rule)(gains, known_by(agent, times, **of_team))
     assert values.shape == (gains.shape[1] + 1,)
     assert values[-1] == 0
     return int(jnp.argmax(values))
@@ -204,7 +207,7 @@ def test_values_of_rules_as_worked_by_hand():
         (policies.auction, [1 / 5, 4 / 3, -1, 0]),
         (policies.gain_rate, [0.2, 0.15, -1, 0]),
     ):
-        np.testing.assert_allclose(rule(gains, times, team(1), jnp.int32(0)), expected, rtol=1e-6)
+        np.testing.assert_allclose(rule(gains, known_by(0, times)), expected, rtol=1e-6)
 
 
 def test_auctions_as_worked_by_hand():
