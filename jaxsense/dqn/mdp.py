@@ -27,7 +27,7 @@ from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Fusion, Index, Key, Scene, call, pytree
 from jaxsense.dqn.rewards import Reward
 from jaxsense.dqn.team import (
-    Steps,
+    NO_TRAVEL,
     Team,
     Teams,
     Travel,
@@ -119,9 +119,9 @@ class Mdp:
         return 2 * size if self.teams is None else num_features(size, self.num_modalities)
 
     @property
-    def travel(self) -> Travel | Steps:
+    def travel(self) -> Travel:
         """How long a look takes."""
-        return Steps() if self.teams is None else self.teams.travel
+        return NO_TRAVEL if self.teams is None else self.teams.travel
 
     @property
     def is_single(self) -> bool:

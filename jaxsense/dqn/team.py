@@ -106,44 +106,6 @@ class Known:
 
 
 @pytree
-class Steps:
-    """No travel: a look takes one step, from anywhere; see `Travel`."""
-
-    look_seconds = 1.0
-
-    def arrival(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Where the robot is."""
-        del place
-        return pose[:2]
-
-    def seconds(
-        self,
-        pose: Float[Array, "3"],
-        place: Float[Array, "2"],
-        to_go: Float[Array, ""] | float = 0.0,
-    ) -> Float[Array, ""]:
-        """One step."""
-        del pose, place, to_go
-        return jnp.float32(1.0)
-
-    def times(self, team: Team, to_go: Float[Array, "R N"]) -> Float[Array, "R N"]:
-        """One step for each robot and PoI."""
-        del to_go
-        return jnp.ones(team.heads.shape)
-
-    def move(
-        self,
-        pose: Float[Array, "3"],
-        place: Float[Array, "2"],
-        seconds: Float[Array, ""],
-        to_go: Float[Array, ""] | float = 0.0,
-    ) -> Float[Array, "3"]:
-        """The pose, which stays."""
-        del place, seconds, to_go
-        return pose
-
-
-@pytree
 class Travel:
     """A robot that turns to a PoI, drives straight until it sees it, and looks.
 
@@ -223,9 +185,13 @@ class Travel:
         return turn, straight, to_place / jnp.maximum(distance, 1e-6)
 
 
+NO_TRAVEL = Travel(view_distance=0.0, speed=1e30, turn_rate=1e30, look_seconds=1.0)
+"""Of a robot that is where all PoIs are: a look takes one second."""
+
+
 def to_go(
     novelty: Novelty,
-    travel: Steps | Travel,
+    travel: Travel,
     team: Team,
     apart: Callable[[jax.Array, jax.Array, jax.Array], jax.Array],
 ) -> Float[Array, "R N"]:
