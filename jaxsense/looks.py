@@ -14,7 +14,6 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsense.config import Config
-from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core import checks
 from jaxsense.core.types import Fusion, Index, Key, Samples, pytree
 from jaxsense.dqn import rewards
@@ -146,13 +145,6 @@ def make_mdp(config: Config, models: Models, looks: LookSource | None = None) ->
     if isinstance(looks, Live):
         reason = "must be a Bank with dqn.task = 'team', whose MDP has no scans"
         raise ValueError(f"looks = Live: {reason}")
-    places = Places(
-        sides=settings.sides,
-        robot_radius=PLANNING_RADIUS,
-        poi_pitch=config.arena.poi_pitch,
-        num_pois=settings.num_pois[1],
-        cells_per_side=settings.cells_per_side,
-    )
     return dataclasses.replace(
         mdp,
         config=dataclasses.replace(config.mdp, max_steps=_MOST_CHOICES),
@@ -161,7 +153,7 @@ def make_mdp(config: Config, models: Models, looks: LookSource | None = None) ->
         teams=Teams(
             settings,
             make_travel(config),
-            places,
+            Places(settings, config.arena.poi_pitch),
             config.modalities,
             novelty=models.novelty if config.detector.num_repeats else None,
         ),

@@ -8,6 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.learning import TeamConfig
+from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Index, Key, pytree, within_a_turn
 
@@ -216,17 +217,12 @@ class Places:
     """Random positions: each PoI in a cell of its own, robots anywhere.
 
     Attributes:
-      sides: `[2]` shortest and longest side of an arena, in metres.
-      robot_radius: `[]` smallest distance of a robot from a wall, in metres.
+      config: numbers of PoIs and sides of arenas.
       poi_pitch: smallest distance of two PoIs' centres, in metres.
-      cells_per_side: cells along a side of an arena.
     """
 
-    sides: tuple[jax.Array | float, jax.Array | float]
-    robot_radius: jax.Array | float
+    config: TeamConfig
     poi_pitch: float = struct.field(pytree_node=False)
-    num_pois: int = struct.field(pytree_node=False)
-    cells_per_side: int = struct.field(pytree_node=False)
 
     def draw(self, key: Key, num_robots: int) -> tuple[Float[Array, "N 2"], Float[Array, "R 3"]]:
         """Draws an arena.
@@ -234,9 +230,10 @@ class Places:
         Returns:
           Positions of the PoIs, in metres, and poses of the robots.
         """
-        num_pois, per_side = self.num_pois, self.cells_per_side
+        num_pois, per_side = self.config.num_pois[1], self.config.cells_per_side
+        shortest, longest = self.config.sides
         draws = jax.random.uniform(key, (1 + per_side**2 + 2 * num_pois + 3 * num_robots,))
-        side = self.sides[0] + (self.sides[1] - self.sides[0]) * draws[0]
+        side = shortest + (longest - shortest) * draws[0]
         order, draws = draws[1 : 1 + per_side**2], draws[1 + per_side**2 :]
         cell = jnp.argsort(order)[:num_pois]
         corner = jnp.stack([cell // per_side, cell % per_side], axis=-1).astype(side.dtype)
@@ -244,7 +241,7 @@ class Places:
         jitter = play * (draws[: 2 * num_pois].reshape(num_pois, 2) - 0.5)
         positions = (corner + 0.5) * side / per_side - side / 2 + jitter
         places = 2 * draws[2 * num_pois :].reshape(num_robots, 3) - 1
-        reach = side / 2 - self.robot_radius
+        reach = side / 2 - PLANNING_RADIUS
         poses = jnp.concatenate([reach * places[:, :2], jnp.pi * places[:, 2:]], axis=-1)
         return positions, poses
 

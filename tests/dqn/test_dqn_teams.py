@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toys import PLACES, TRAVEL, Fixed, classes_mdp, noisy_mdp, team_mdp_of
 
+from jaxsense.config.learning import TeamConfig
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import starts
 from jaxsense.dqn.team import Places, Team, Travel
@@ -195,15 +196,14 @@ def test_first_choices_go_round_the_robots_that_work():
 
 
 def test_pois_are_anywhere_in_cells_of_their_own_and_robots_anywhere():
-    places = Places((2.0, 4.0), 0.1, poi_pitch=0.6, num_pois=3, cells_per_side=2)
+    places = Places(TeamConfig(num_pois=(2, 2), sides=(2.0, 4.0)), poi_pitch=0.6)
     keys = jax.random.split(jax.random.key(0), 4000)
     positions, poses = jax.jit(jax.vmap(lambda key: places.draw(key, 2)))(keys)
-    # The sides are 2 to 4 m: cells of 1 to 2 m, of which a PoI keeps .3 m from either end.
+    # Two cells along sides of 2 to 4 m: each 1 to 2 m, of which a PoI keeps .3 m from either end.
     for x in (positions, -positions):
         assert 1.6 < x.max() < 1.7
     assert 0.3 < jnp.abs(positions).min() < 0.31
-    apart = jnp.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
-    assert apart[:, [0, 0, 1], [1, 2, 2]].min() > 0.6
+    assert jnp.linalg.norm(positions[:, 0] - positions[:, 1], axis=-1).min() > 0.6
     for x in (poses, -poses):
         np.testing.assert_allclose(x.max(axis=(0, 1)), [1.9, 1.9, jnp.pi], rtol=0.05)
     assert jnp.abs(poses[..., :2]).max() < 1.9
