@@ -49,17 +49,23 @@ class FitState:
     loss: jax.Array
 
 
-def _adam(problem: Problem[D]) -> optax.GradientTransformation:
-    """Adam with a learning rate that falls to zero along a cosine."""
+def adam(
+    learning_rate: float | jax.Array, steps: int, last: float = 0.0
+) -> optax.GradientTransformation:
+    """Adam with a learning rate that falls along a cosine.
+
+    Args:
+      steps: until the learning rate stays.
+      last: share of the learning rate that is left then.
+    """
     # Flattened: for networks this small, per-array overhead dominates.
-    return optax.flatten(
-        optax.adam(optax.cosine_decay_schedule(problem.learning_rate, problem.steps))
-    )
+    return optax.flatten(optax.adam(optax.cosine_decay_schedule(learning_rate, steps, last)))
 
 
 def start(params: Params, problem: Problem[D]) -> FitState:
     """State before the first step."""
-    return FitState(params, _adam(problem).init(params), jnp.int32(0), jnp.float32(jnp.inf))
+    optimiser = adam(problem.learning_rate, problem.steps).init(params)
+    return FitState(params, optimiser, jnp.int32(0), jnp.float32(jnp.inf))
 
 
 def fit(
@@ -71,7 +77,7 @@ def fit(
       The state after the last step and the losses, without meaning beyond the end of the fit. The
       last one of the fit is NaN if the parameters after it are not finite.
     """
-    optimiser, total = _adam(problem), problem.steps
+    optimiser, total = adam(problem.learning_rate, problem.steps), problem.steps
     drawn = problem.draw(key, number)
 
     def make_step(state: FitState, drawn: D) -> tuple[FitState, jax.Array]:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from jaxsense.config import DqnConfig
 from jaxsense.core import checks
 from jaxsense.core.networks import Params
+from jaxsense.core.supervised import adam
 from jaxsense.core.types import Key, Transition, pytree
 from jaxsense.dqn import replay
 from jaxsense.dqn.agent import Environment, Underway
@@ -283,13 +284,7 @@ def _learn(
 
 
 def _optimiser(config: DqnConfig) -> optax.GradientTransformation:
-    schedule = optax.cosine_decay_schedule(
-        config.learning_rate,
-        config.epochs * config.updates,
-        _FINAL_RATE,
-    )
-    # Flattened: for networks this small, per-array overhead dominates.
-    return optax.flatten(optax.adam(schedule))
+    return adam(config.learning_rate, config.epochs * config.updates, _FINAL_RATE)
 
 
 def _restart(rows: jax.Array, envs: Underway, shares: Underway, done: jax.Array) -> Underway:
