@@ -98,11 +98,6 @@ class Mdp:
         return self.looks.num_modalities
 
     @property
-    def modalities(self) -> tuple[str, ...]:
-        """Names of the sensors; of a team."""
-        return () if self.teams is None else self.teams.modalities
-
-    @property
     def num_actions(self) -> int:
         """A: a look at each PoI, and NOP."""
         return self.num_pois + 1

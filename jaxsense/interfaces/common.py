@@ -119,7 +119,7 @@ def robots_of(mdp: Mdp | Task, config: Config | None = None) -> Robots:
     if isinstance(mdp, Task) and mdp.mdp.teams and config is None:
         carried = tuple(mdp.modalities[int(m)] for m in mdp.mdp.robots)
         return Robots(mdp, names_of_robots(carried))
-    if isinstance(mdp, Mdp) and mdp.teams and config and mdp.modalities == config.modalities:
+    if isinstance(mdp, Mdp) and mdp.teams and config and mdp.teams.modalities == config.modalities:
         robots = jnp.array(config.modality_of_robot, jnp.int32)
         whole = dataclasses.replace(mdp.teams, is_random=False)
         played = dataclasses.replace(mdp, robots=robots, teams=whole)
