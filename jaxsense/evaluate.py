@@ -170,9 +170,6 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     """The run's settings with the arena and the team of these missions."""
     changed = {name: x for name, x in vars(arguments.arena).items() if x is not None}
     arena = dataclasses.replace(config.arena, **changed)
-    least, most = config.team.num_pois
-    if config.dqn.task == "team" and not least <= arena.num_pois <= most:
-        cli.warn(PROGRAM, f"{arena.num_pois} PoIs: the Q-network learned with {least} to {most}")
     # The Q-network of one agent has an input for each PoI.
     if not plays(arena.num_pois):
         reason = f"must be {config.arena.num_pois}, as in training; others need dqn.task = team"
@@ -181,13 +178,13 @@ def _elsewhere(arguments: Arguments, config: Config, plays: Callable[[int], bool
     if given is not None and sorted(given) != sorted(config.carried):
         # In one order, so that a team plays in the same arenas however it is named.
         robots = tuple(sorted(given, key=[*config.modalities, *given].index))
-        each, most = max(map(robots.count, robots)), looks.ROBOTS_EACH
-        if config.dqn.task == "team" and each > most:
-            cli.warn(PROGRAM, f"{each} robots of a sensor: the Q-network learned with up to {most}")
     # No mission starts with a map that is partly seen, which limits the number of PoIs.
     is_partly_seen = config.mdp.partly_seen_starts and arena == config.arena
     mdp = dataclasses.replace(config.mdp, partly_seen_starts=is_partly_seen)
-    return dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
+    there = dataclasses.replace(config, arena=arena, robots=robots, mdp=mdp)
+    for what in looks.beyond_training(there):
+        cli.warn(PROGRAM, what)
+    return there
 
 
 def _cases(arguments: Arguments, scenario: mission.Mission) -> dict[str, mission.Case]:

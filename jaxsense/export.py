@@ -29,6 +29,7 @@ from jaxsense.core.types import Belief
 from jaxsense.dqn.policies import POLICIES, Known
 from jaxsense.dqn.team import Team, to_go
 from jaxsense.interfaces.common import extra
+from jaxsense.looks import beyond_training
 from jaxsense.mission import maps
 from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, RECENT_LOOKS
@@ -307,6 +308,8 @@ def main(argv: list[str] | None = None) -> None:
         devices.start(1)
         run = rundir.newest(run) if is_run else run
         config, models = rundir.load(run, arguments.trust)
+        for what in beyond_training(config):
+            cli.warn(PROGRAM, what)
         preset = str(run).removeprefix(PREFIX)
         path = path or (run / "exported.zip" if is_run else Path(f"{preset}.zip"))
         # Before seconds of work.

@@ -160,6 +160,23 @@ def make_mdp(config: Config, models: Models, looks: LookSource | None = None) ->
     )
 
 
+def beyond_training(config: Config) -> list[str]:
+    """What missions ask of the Q-network of a team that it does not learn with; a line each."""
+    if config.dqn.task == "map":
+        return []
+    each, team = max(map(config.carried.count, config.carried)), config.team
+    found = {
+        f"{config.arena.num_pois} PoIs": (config.arena.num_pois, team.num_pois),
+        f"an arena of {config.arena.side:g} m": (config.arena.side, team.sides),
+        f"{each} robots of a sensor": (each, (1, ROBOTS_EACH)),
+    }
+    return [
+        f"{what}: the Q-network learns with {least:g} to {most:g}"
+        for what, (number, (least, most)) in found.items()
+        if not least <= number <= most
+    ]
+
+
 def mdp_of_one(
     config: Config, fusion: Fusion, looks: LookSource, modality: Index, num_pois: int | None = None
 ) -> Mdp:

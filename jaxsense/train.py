@@ -20,6 +20,7 @@ import numpy as np
 from jaxsense.config import PRESETS, Config, ConfigError
 from jaxsense.config.options import command, given
 from jaxsense.config.section import Checked, limited, require_known
+from jaxsense.looks import beyond_training
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, output, pipeline, rundir
 from jaxsense.run.devices import MAX_DEVICES
@@ -185,6 +186,8 @@ def _train(arguments: Arguments, run: RunDirectory, policies: OwnPolicies | None
     config, failed, monitor = run.settings.config, dict[int, str](), Monitor(warn=_warn)
     workers = devices.start(arguments.devices)
     kept = cli.keep_programs(PROGRAM, arguments.cache, config, has_own_code=bool(policies))
+    for what in beyond_training(config):
+        _warn(what)
     is_left = np.array([not (path / "summary.json").exists() for path in run.seeds.values()])
     left = [*itertools.compress(run.seeds.items(), devices.of_first_process(is_left))]
 

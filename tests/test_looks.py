@@ -15,7 +15,6 @@ from untrained import blank, untrained
 import jaxsense
 from jaxsense import looks
 from jaxsense.config import PRESETS, JmvaeConfig
-from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.dqn import mdp as mdps
 from jaxsense.dqn import starts
 from jaxsense.looks import Bank, Live
@@ -108,10 +107,9 @@ def test_an_agent_of_a_team_has_the_mdp_of_a_team():
     assert mdp.num_pois == config.team.num_pois[1]
     assert mdp.robots.tolist() == [0, 0, 1, 1]
     places = mdp.teams.places
-    assert places.poi_pitch == config.arena.poi_pitch
-    assert places.robot_radius == PLANNING_RADIUS
+    assert (places.config, places.poi_pitch) == (config.team, config.arena.poi_pitch)
     # Nothing else of them is an input of a compiled program.
-    assert jax.tree.leaves(places) == [*config.team.sides, PLANNING_RADIUS]
+    assert jax.tree.leaves(places) == jax.tree.leaves(config.team)
     assert mdp.teams.config is config.team
 
 
@@ -190,3 +188,14 @@ def test_live_and_bank_features_have_the_same_distribution(modality):
     bank = np.asarray(jaxsense.detections(jax.random.key(0), config, models, NUM_LOOKS)[modality])
     for c in range(3):
         assert scipy.stats.ks_2samp(found[classes == c, 0], bank[c, :, 0]).pvalue > 1e-3
+
+
+def test_missions_beyond_those_that_a_team_learns_for_are_told():
+    team = PRESETS["team"]
+    beyond = replace(team.arena, num_pois=9, side=6.5)
+    assert looks.beyond_training(replace(team, arena=beyond, robots=("camera",) * 3)) == [
+        "9 PoIs: the Q-network learns with 3 to 8",
+        "an arena of 6.5 m: the Q-network learns with 3 to 6",
+        "3 robots of a sensor: the Q-network learns with 1 to 2",
+    ]
+    assert not any(looks.beyond_training(PRESETS[name]) for name in ("team", "paper", "smoke"))

@@ -107,3 +107,11 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
     line = error_line([*SMOKE, "--out", str(smoke_run)], capsys)
     assert f"out = {str(smoke_run)!r}: is not empty; must be a new or empty directory" in line
     assert {path: path.stat().st_mtime_ns for path in smoke_run.rglob("*")} == before
+
+
+@pytest.mark.slow
+def test_what_a_run_cannot_learn_is_told(cache, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(train, "beyond_training", lambda config: ["9 PoIs: too many"])
+    train.main([*SMOKE, *cache, "--out", str(tmp_path / "run"), "--mdp.min-increase", "50"])
+    told = ["9 PoIs: too many", "no look pays: lower its price, or mdp.min_increase"]
+    assert capsys.readouterr().err.splitlines() == [f"jaxsense.train: {line}" for line in told]

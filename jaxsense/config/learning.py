@@ -147,6 +147,10 @@ class MdpConfig(Section, place="mdp"):
         require(is_named, self, "reward", "must be paper, nats or package.module:function")
 
 
+LOOK_SECONDS = 0.45
+"""Duration of a robot's look, in seconds."""
+
+
 class TeamConfig(Section, place="team"):
     """The MDP with travel (`dqn.task` = team), in which robots have positions and looks take time.
 

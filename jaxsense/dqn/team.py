@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config.learning import TeamConfig
+from jaxsense.config.learning import LOOK_SECONDS, TeamConfig
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Index, Key, pytree, within_a_turn
@@ -122,7 +122,7 @@ class Travel:
     view_distance: jax.Array | float
     speed: jax.Array | float = 0.2
     turn_rate: jax.Array | float = 1.0
-    look_seconds: jax.Array | float = 0.45
+    look_seconds: jax.Array | float = LOOK_SECONDS
 
     def arrival(self, pose: Float[Array, "3"], place: Float[Array, "2"]) -> Float[Array, "2"]:
         """Where a robot that drives to a PoI first sees it, in metres."""

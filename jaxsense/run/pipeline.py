@@ -196,6 +196,9 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> TrainingRes
     measured, reliability = jax.tree.map(np.asarray, outputs["detector_metrics"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
     beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
+    tables = [np.append(values.q, values.q_unseen) for values in outputs["look_values"]]
+    if not np.any(np.concatenate(tables) > 0):
+        programs.monitor.warn("no look pays: lower its price, or mdp.min_increase")
     is_sound = compare.unsound(beliefs) is None
 
     def agent(modality: str, values: Output) -> blocks.Agent:

@@ -1,6 +1,7 @@
 """Scores of policies in missions, compared with built-in policies in the same arenas."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 
 import jax
@@ -13,6 +14,7 @@ from jaxsense.config.section import Checked, limited, require, require_function
 from jaxsense.core import checks
 from jaxsense.core.types import Key
 from jaxsense.dqn.policies import POLICIES, Known, Trained, Values
+from jaxsense.looks import beyond_training
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models, require_fitting
 from jaxsense.run import devices, missions
@@ -115,6 +117,8 @@ def score_missions(
         expected = "must be the number of PoIs that the models were trained with"
         raise ConfigError("arena.num_pois", number, expected)
     require_fitting(config, models)
+    for what in beyond_training(config):
+        warnings.warn(what, stacklevel=2)
     own = {
         name: each if name in POLICIES else _checked(name, each) for name, each in policies.items()
     }

@@ -112,6 +112,7 @@ def test_plain_settings_are_refused_or_used(stored):
 
 TWINS = {**COLOURS, "crimson": COLOURS["red"]}
 REDS = "red cylinder", "red cube"
+PRICES = {"dqn.task": "team", "mdp.reward": "nats", "mdp.look_cost": 0.1}
 FROM_SCANS = {"jmvae.learns_from": "scans", "jmvae.fusion": "filter"}
 POSTS = {**SHAPES, "slab": Shape("box", (1.0, 0.5)), "post": Shape("box", (0.5, 0.5))}
 SIXTEEN = tuple(f"{colour} {shape}" for colour in COLOURS for shape in POSTS)
@@ -166,6 +167,8 @@ CHANGES = [
     ({"viewpoint.max_distance": 1.6}, "must be at most half the arena's side, 1.5 m"),
     ({"navigation.view_range": 1.3}, "= 1.3: must be at most viewpoint.max_distance = 1.2 m"),
     ({"mdp.reward": "nats", "mdp.look_cost": 1.1}, "look_cost = 1.1: must be below 1.1, all the"),
+    # ln 3 less .1 nats of a look of .45 s.
+    (PRICES | {"team.second_cost": 2.22}, "team.second_cost = 2.22: must be below 2.22: none"),
     ({"navigation.view_range": 0.29}, "navigation.view_range = 0.29: must be at least 0.300 m"),
     (
         {"mdp.partly_seen_starts": True, "arena.num_pois": 16, "arena.side": 6.0},
@@ -244,6 +247,7 @@ AT_LIMITS = [
     {"mission.localisation": LocalisationConfig(search=(0.3, 30.0), error=(1.0, 180.0))},
     {"dqn.epochs": 970, "dqn.replay_capacity": 32},  # in chunks of 10
     {"team.num_pois": (3, 3), "team.sides": (4.0, 4.0), "mdp.reward": "nats", "mdp.look_cost": 1.0},
+    PRICES | {"team.second_cost": 2.21},
     FROM_SCANS | {"lidar.num_beams": 77, "lidar.window": 20},
     FROM_SCANS | {"lidar.window": 512},
     FROM_SCANS | {"lidar.window": 3, "lidar.window_range": 1.2},

@@ -72,3 +72,10 @@ def test_a_missing_package_is_one_line_with_its_extra(run, tmp_path, monkeypatch
     line = error_line([str(run), "--out", str(tmp_path / "x.zip")], capsys, export)
     assert line == f"jaxsense.export: {package} is not installed: pip install 'jaxsense[export]'"
     assert not [*tmp_path.iterdir()]
+
+
+def test_missions_that_the_network_did_not_learn_for_are_told(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(export, "beyond_training", lambda config: ["9 PoIs: too many"])
+    monkeypatch.setattr(export, "archive", lambda config, models: b"")
+    export.main([str(run), "--out", str(tmp_path / "x.zip")])
+    assert capsys.readouterr().err == "jaxsense.export: 9 PoIs: too many\n"

@@ -87,3 +87,9 @@ def test_a_policy_without_a_value_for_each_action_is_named(values):
         ValueError, match=r"^policies\['mine'\] = <lambda>: must return floats of shape \[4\]"
     ):
         checked(None, None, SimpleNamespace(looks=np.zeros((3, 2))))
+
+
+def test_missions_that_the_network_did_not_learn_for_are_told(play, monkeypatch):
+    monkeypatch.setattr(score, "beyond_training", lambda config: ["9 PoIs: too many"])
+    with pytest.warns(UserWarning, match="^9 PoIs: too many$"):
+        play({}, against=["naive"], episodes=4)
