@@ -19,7 +19,7 @@ from jaxsense.dqn.optimum import interpolate
 from jaxsense.dqn.rewards import information
 from jaxsense.interfaces import common as interfaces_common
 from jaxsense.looks import Bank, make_mdp
-from jaxsense.mission import begin
+from jaxsense.mission import begin, roadmap
 from jaxsense.mission.outcome import is_fault
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.models import Models
@@ -143,7 +143,8 @@ def walls(*distances):
 def start(w, **inputs):
     """A mission that begins with some inputs changed."""
     given = {"classes": w.classes, "policy": 0, "faults": no_faults(SMOKE), **inputs}
-    return begin.start(w.mission, w.models, w.scene, **given)
+    paths, no_error = roadmap.build(SMOKE, w.scene.layout), jnp.zeros_like(w.scene.poses)
+    return begin.start(w.mission, w.models, w.scene, **given, paths=paths, pose_error=no_error)
 
 
 def value_iteration(w, **changed):

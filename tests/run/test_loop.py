@@ -54,7 +54,7 @@ def toy(replace_training, tmp_path):
         heard, warned = [], []
         monitor = Monitor(lambda *report: heard.append(report), warned.append)
         path = tmp_path if saved else Path(tempfile.mkdtemp(dir=tmp_path))
-        checkpoints = Checkpoints(path, warned.append)
+        checkpoints = Checkpoints(path)
         with Compiler(monitor) as compiler:
             outputs, curves = pipeline.train(KEY, Programs(SMOKE, compiler), checkpoints)
         found = SimpleNamespace(outputs=outputs, curves=curves)
