@@ -23,8 +23,6 @@ from .looks import detections as detections
 from .looks import make_mdp as make_mdp
 from .models import Models as Models
 from .models import init as init
-from .models import make_bayes as make_bayes
-from .models import make_in_place as make_in_place
 from .models import make_jmvae as make_jmvae
 from .run.rundir import load as load
 from .run.score import MissionScore as MissionScore
