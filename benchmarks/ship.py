@@ -20,10 +20,10 @@ import jaxsense
 from jaxsense import Bank, Config, Models
 from jaxsense.config import as_plain
 from jaxsense.core.types import Samples, by_place
+from jaxsense.models import make_models
 from jaxsense.tasks import PRETRAINED, Task, registry
 from jaxsense.tasks.registry import Origin
 from jaxsense.tasks.task import EPISODES, SEEDS, Scaling
-from jaxsense.training.comparison import models_of
 
 _KEY = 20261126
 _LOOKS = 12288  # by each sensor, at all classes together
@@ -103,10 +103,8 @@ def freeze(
     made: Origin,
 ) -> None:
     """Writes the file of a task, whose name ends in `.npz`."""
-    parts, acting = (
-        models_of(config, trained.fusion, trained.look_values),
-        registry.agents_of(config),
-    )
+    parts = make_models(config, fusion=trained.fusion, look_values=trained.look_values)
+    acting = registry.agents_of(config)
 
     def task(agent: str, scaling: Scaling) -> Task:
         return registry.task_of(name, agent, config, parts, Bank(looks), scaling, jnp.zeros((0, 0)))

@@ -184,9 +184,24 @@ def make_bayes(config: Config) -> Bayes:
 
 
 def make_models(config: Config, **trained: Any) -> Models:
-    """Models of their trained parts; `domains`, `bayes` and `agent` follow from the settings."""
-    domains = tuple(make_domain(config, sensor) for sensor in sensors.make(config))
-    return Models(domains=domains, bayes=make_bayes(config), agent=make_agent(config), **trained)
+    """Models of their trained parts; `domains`, `bayes` and `agent` follow from the settings.
+
+    Args:
+      trained: other fields of `Models`, at least `fusion`; of the rest there is nothing yet.
+    """
+    untrained = {
+        "detectors": (),
+        "jmvae": {},
+        "novelty": novelty.independent(len(config.modalities)),
+        "look_values": (),
+        "q_networks": (),
+    }
+    return Models(
+        domains=tuple(make_domain(config, sensor) for sensor in sensors.make(config)),
+        bayes=make_bayes(config),
+        agent=make_agent(config),
+        **{**untrained, **trained},
+    )
 
 
 def make_agent(config: Config) -> Agent:
@@ -298,7 +313,6 @@ def init(key: Key, config: Config) -> Models:
         detectors=untrained,
         jmvae=params,
         fusion=fused,
-        novelty=novelty.independent(len(config.modalities)),
         look_values=tuple(_no_values(config, m) for m in config.modalities),
         q_networks=tuple(agent.init(k) for k in dqn_keys),
     )

@@ -4,7 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsense.core import checks, networks
 from jaxsense.core.networks import MLP, Params
@@ -115,10 +115,6 @@ class Environment:
         num_robots, seen = len(now.team.works), self._observe(now)
         nothing = jnp.zeros((num_robots, len(seen)))
         return Underway(now, nothing, jnp.full(num_robots, self.mdp.num_pois))
-
-    def action_mask(self, state: Underway) -> Bool[Array, " A"]:
-        """Actions that exist."""
-        return state.now.team.action_mask
 
     def observe(self, state: Underway) -> Float[Array, " S"]:
         """What the robot that chooses observes."""

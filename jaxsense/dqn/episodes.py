@@ -21,7 +21,6 @@ from jaxsense.dqn.policies import Known, Trained
 
 M = TypeVar("M")
 
-MAX_STATES = 4096
 _NUM_DRAWS = 1024
 _AT_ONCE = 1024  # simulated looks, to save memory
 _FINE = 16  # steps of a lattice between whose points values are right to a hundredth
@@ -151,7 +150,7 @@ class _Carry:
 
 
 def every_state(
-    num_pois: int, num_classes: int, num_modalities: int, limit: int = MAX_STATES
+    num_pois: int, num_classes: int, num_modalities: int, limit: int = 4096
 ) -> tuple[Int[np.ndarray, "S N"], Bool[np.ndarray, "S N M"]]:
     """Lists the `C^N 2^(N M)` states of the map: every combination of classes, every set of looks.
 
@@ -174,11 +173,6 @@ def every_state(
     places = np.array([num_classes**n for n in reversed(range(num_pois))], object)
     classes = (states[:, None] // places % num_classes).astype(np.int32)
     return classes, bits.astype(bool).reshape(-1, num_pois, num_modalities)
-
-
-def are_different(classes: Int[np.ndarray, "S N"]) -> Bool[np.ndarray, " S"]:
-    """Whether all classes of a state differ, as in the paper's `N! 2^(N M)` states."""
-    return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)
 
 
 Reference = Callable[[Known, jax.Array], jax.Array]

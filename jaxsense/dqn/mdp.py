@@ -257,7 +257,9 @@ def step(key: Key, mdp: Mdp, state: State, action: Int[Array, ""]) -> tuple[Stat
     # A look under way continues while another robot looks.
     looked = jnp.maximum(state.looked + seconds - (times - mdp.travel.look_seconds), 0.0)
     looked = jnp.where(is_looker, 0.0, jnp.minimum(looked, mdp.travel.look_seconds))
-    moved = jax.vmap(mdp.travel.move, (0, 0, None, 0))(team.poses, goals, seconds, to_go)
+    moved = team.poses
+    if mdp.teams is not None:
+        moved = jax.vmap(mdp.travel.move, (0, 0, None, 0))(moved, goals, seconds, to_go)
     poi = jnp.where(passes, target[looker], nop)
     place = moved[looker, :2]
     distance = jnp.linalg.norm(place - team.positions[jnp.minimum(poi, nop - 1)])

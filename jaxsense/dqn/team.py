@@ -187,7 +187,7 @@ class Travel:
 
 
 NO_TRAVEL = Travel(view_distance=0.0, speed=1e30, turn_rate=1e30, look_seconds=1.0)
-"""Of a robot that is where all PoIs are: a look takes one second."""
+"""Of a robot that does not travel: a look takes one second, from anywhere."""
 
 
 def to_go(

@@ -204,8 +204,7 @@ def _epoch(
     ended_reward = jnp.sum(jnp.where(has_ended, total_reward, 0.0))
 
     params, optimiser, loss = _learn(config, environment, state, memory, draws.replay)
-    is_copied = (state.epoch + 1) % config.target_period == 0
-    target = jax.tree.map(lambda new, old: jnp.where(is_copied, new, old), params, state.target)
+    target = optax.periodic_update(params, state.target, state.epoch + 1, config.target_period)
     checked = values, transitions.r_t, loss, params
     is_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(checked)]).all()
     info = EpochInfo(
@@ -241,7 +240,7 @@ def _explore(
     s_tm1 = jax.vmap(environment.observe, out_axes=-1)(started)
     values = environment.agent.values(params, s_tm1)
     highest = jnp.argmax(values, axis=0).astype(jnp.int32)
-    a_tm1 = jnp.where(draws.coin < epsilon, _explored(environment, started, draws.action), highest)
+    a_tm1 = jnp.where(draws.coin < epsilon, _explored(started, draws.action), highest)
 
     columns = Transition(-1, 0, 0, 0, -1)  # pyright: ignore[reportArgumentType]
     steps = jax.vmap(environment.step, in_axes=(0, 0, -1, 0), out_axes=(0, columns, 0))
@@ -249,9 +248,9 @@ def _explore(
     return envs, outcome.terminated | outcome.truncated, transitions, values
 
 
-def _explored(environment: Environment, states: Underway, draws: jax.Array) -> jax.Array:
+def _explored(states: Underway, draws: jax.Array) -> jax.Array:
     """Random `[E]` int32 actions that exist in `[E]` states, from `[E]` draws in [0, 1)."""
-    exist = jax.vmap(environment.action_mask)(states)
+    exist = jax.vmap(lambda state: state.now.team.action_mask)(states)
     number = jnp.floor(draws * jnp.sum(exist, axis=1, dtype=draws.dtype)).astype(jnp.int32)
     return jnp.argmax(jnp.cumsum(exist, axis=1) > number[:, None], axis=1).astype(jnp.int32)
 

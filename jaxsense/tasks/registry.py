@@ -18,7 +18,6 @@ from jaxsense.dqn.team import Travel
 from jaxsense.looks import Bank, make_mdp
 from jaxsense.models import Models
 from jaxsense.tasks.task import Scaling, Task, fixed_draws, key_of_seed
-from jaxsense.training.comparison import models_of
 
 Arrays = dict[str, np.ndarray]
 
@@ -104,7 +103,7 @@ def make(name: str, agent: str | None = None) -> Task:
     require_known("agent", agent, acting)
     looks = Bank(tuple(jnp.asarray(arrays[f"looks/{m}"]) for m in range(len(config.modalities))))
     scaling = Scaling(jnp.asarray(arrays["scaling/offset"]), jnp.asarray(arrays["scaling/scale"]))
-    parts = models_of(config, **_trained(arrays, config, "fusion", "look_values"))
+    parts = models.make_models(config, **_trained(arrays, config, "fusion", "look_values"))
     returns = jnp.asarray(arrays[f"returns/{agent}"])
     return task_of(name, agent, config, parts, looks, scaling, returns)
 

@@ -12,17 +12,16 @@ from jaxtyping import Array, Int
 from jaxsense.config import Config
 from jaxsense.core.novelty import Novelty
 from jaxsense.core.types import Belief, Fusion, Key
-from jaxsense.dqn import optimum, rewards
+from jaxsense.dqn import episodes, optimum, rewards
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Environment, Underway
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.training import DqnState
-from jaxsense.looks import Bank, Live, make_mdp
-from jaxsense.models import make_agent, make_bayes, make_prior
+from jaxsense.looks import Bank, Live, make_mdp, mdp_of_one
+from jaxsense.models import make_agent, make_bayes, make_models, make_prior
 from jaxsense.sim.world import make_world
 from jaxsense.training import comparison
-from jaxsense.training.comparison import held_out_mdp, models_of
 from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Drive, Output, Progress, Stage
 from jaxsense.vae import readout
@@ -115,7 +114,7 @@ def _environment(
     """What an agent learns in."""
     is_live, bank = config.dqn.observe == "live", detections.by_distance or Bank(detections.bank)
     looks = Live(make_world(config), detectors) if is_live else bank
-    models = dataclasses.replace(models_of(config, fusion), novelty=novelty)
+    models = make_models(config, fusion=fusion, novelty=novelty)
     mdp = make_mdp(config, models, looks)
     return Environment(make_agent(config), mdp.of(modality) if mdp.teams is None else mdp)
 
@@ -126,9 +125,10 @@ def _starts(
     """First states of episodes, `[num_starts]` to learn from, and those of all evaluations."""
     learn_key, held_out_key = jax.random.split(key)
     learning = _environment(config, jnp.int32(0), detections, **given)
-    held_out = held_out_mdp(config, given["fusion"], detections, jnp.int32(0))
+    held_out = mdp_of_one(config, given["fusion"], Bank(detections.held_out), jnp.int32(0))
     prepared = dqn.starts(learn_key, learning, config.dqn)
-    return prepared, comparison.evaluation_starts(held_out_key, held_out, config)
+    reset = jax.vmap(lambda key: episodes.reset(key, held_out, make_bayes(config)))
+    return prepared, reset(jax.random.split(held_out_key, config.evaluation.num_starts))
 
 
 def _begin(
@@ -154,7 +154,7 @@ def _advance(
     detections: Detections,
     **given: Any,
 ) -> tuple[DqnState, Progress]:
-    mdp = held_out_mdp(config, given["fusion"], detections, modality)
+    mdp = mdp_of_one(config, given["fusion"], Bank(detections.held_out), modality)
     evaluate = comparison.evaluation(mdp, config, starts[1])
     learning = _environment(config, modality, detections, **given)
     state, info = dqn.train_chunk(key, learning, config.dqn, state, starts[0], evaluate)

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config import Config
-from jaxsense.core import novelty
 from jaxsense.core.networks import Params
-from jaxsense.core.types import Fusion, Index, Key
+from jaxsense.core.types import Fusion, Key
 from jaxsense.dqn import episodes, policies
 from jaxsense.dqn import training as dqn
 from jaxsense.dqn.agent import Underway
@@ -22,7 +21,7 @@ from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Known
 from jaxsense.dqn.starts import random_start
 from jaxsense.looks import Bank, mdp_of_one
-from jaxsense.models import Models, make_bayes, make_models
+from jaxsense.models import Models, make_models
 from jaxsense.training.detections import Detections
 from jaxsense.training.stage import Output
 
@@ -38,46 +37,11 @@ _STATE_BY_STATE = ("latent", "optimal")
 _LEAST_GROUP = 1152  # episodes: smaller groups cost more than they save
 
 
-def models_of(
-    config: Config,
-    fusion: Fusion,
-    look_values: tuple[LookValues, ...] = (),
-    q_networks: tuple[Params, ...] = (),
-) -> Models:
-    """Models trained so far; the others are empty."""
-    return make_models(
-        config,
-        detectors=(),
-        jmvae={},
-        fusion=fusion,
-        novelty=novelty.independent(len(config.modalities)),
-        look_values=look_values,
-        q_networks=q_networks,
-    )
-
-
-def held_out_mdp(
-    config: Config,
-    fusion: Fusion,
-    detections: Detections,
-    modality: Index,
-    num_pois: int | None = None,
-) -> Mdp:
-    """MDP of one robot with held-out features, in which policies are measured."""
-    return mdp_of_one(config, fusion, Bank(detections.held_out), modality, num_pois)
-
-
-def evaluation_starts(key: Key, mdp: Mdp, config: Config) -> Start:
-    """Random starts, `[evaluation.num_starts]`; all evaluations share them."""
-    reset = jax.vmap(lambda key: episodes.reset(key, mdp, make_bayes(config)))
-    return reset(jax.random.split(key, config.evaluation.num_starts))
-
-
 def evaluation(mdp: Mdp, config: Config, starts: Start) -> dqn.Evaluate:
     """The mean total reward of a Q-network's policy, in one episode from each start."""
 
     def evaluate(key: Key, q_network: Params) -> Float[Array, ""]:
-        models = models_of(config, mdp.fusion, (), (q_network,))
+        models = make_models(config, fusion=mdp.fusion, q_networks=(q_network,))
 
         def act(key: Key, known: Known, memory: tuple[()]) -> tuple[jax.Array, tuple[()]]:
             return policies.best(policies.latent(key, models, known)), memory
@@ -102,7 +66,7 @@ def compare_policies(
 
     Args:
       models: whose only Q-network is that of the robot's modality.
-      mdp: from `held_out_mdp`.
+      mdp: of one robot, with held-out features.
       random: classes and earlier looks of random starts.
 
     Returns:
@@ -184,9 +148,12 @@ def _every_state(
 
 
 def permutations(config: Config) -> Bool[np.ndarray, " S"]:
-    """Whether the classes of each compared state of the map differ, as in the paper."""
+    """Whether all classes of each compared state of the map differ.
+
+    These are the `N! 2^(N M)` states of the paper.
+    """
     classes, _ = _every_state(config.arena.num_pois, config)
-    return episodes.are_different(classes)
+    return np.all(np.diff(np.sort(classes, axis=1), axis=1) > 0, axis=1)
 
 
 def play_policies(
@@ -205,8 +172,8 @@ def play_policies(
 
     With another number of PoIs than in the arena, other starts are drawn.
     """
-    models = models_of(config, fusion, look_values, (q_network,))
-    mdp = held_out_mdp(config, fusion, detections, modality, num_pois)
+    models = make_models(config, fusion=fusion, look_values=look_values, q_networks=(q_network,))
+    mdp = mdp_of_one(config, fusion, Bank(detections.held_out), modality, num_pois)
     start = starts[1].state.classes, starts[1].state.seen
     if num_pois is not None:
         start_key, key = jax.random.split(key)

@@ -31,15 +31,6 @@ def play(mdp, act, seen, modality=0):
     return episodes.run_episode(KEY, mdp.of(modality), Ignorant(), forgetting(act(seen)), begun)
 
 
-def test_the_states_of_the_paper_are_those_whose_classes_differ():
-    classes, seen = episodes.every_state(3, 3, 2)
-    is_of_paper = episodes.are_different(classes)
-    assert np.sum(is_of_paper) == 384  # 3! x 2^6
-    np.testing.assert_array_equal(np.sort(classes[is_of_paper], axis=1), [[0, 1, 2]] * 384)
-    rows = np.concatenate([classes, seen.reshape(-1, 6)], axis=1)[is_of_paper]
-    assert len(np.unique(rows, axis=0)) == 384
-
-
 def test_naive_play_has_the_total_worked_by_hand():
     # PoI 0 unseen: .2 - .158114; PoI 1 seen by the LiDAR: 1 - .2; PoI 2 seen by both: no look.
     total, first = play(MDP, lambda seen: policy("naive"), [[0, 0], [0, 1], [1, 1]])

@@ -91,23 +91,17 @@ def test_random_takes_every_action_equally_often():
     np.testing.assert_allclose(np.bincount(actions, minlength=4), 1000, atol=110)
 
 
-def test_latent_takes_the_action_that_the_own_q_network_values_most():
-    agent = Agent(0.5, 0.0, None, 3, 2, 2, (4,))
-    layers = agent.init(KEY)["params"]
-
-    def biased(best):
-        bias = 100.0 * (jnp.arange(4) == best)
-        return {"params": {**layers, "Dense_1": {**layers["Dense_1"], "bias": bias}}}
-
-    class Classes:
-        classes = Belief(*jnp.ones((2, 5, 2)))
-
+def test_latent_takes_the_action_that_the_own_q_network_values_most(monkeypatch):
+    monkeypatch.setattr(Agent, "values", lambda agent, params, observed: params)
+    agent, classes = Agent(0.5, 0.0, None, 3, 2, 2, (4,)), Belief(*jnp.ones((2, 5, 2)))
+    models = {"agent": agent, "fusion": SimpleNamespace(classes=classes)}
     for best in range(4):
-        networks = biased(best), biased((best + 1) % 4)
-        models = {"agent": agent, "q_networks": networks, "fusion": Classes}
+        networks = jax.nn.one_hot(best, 4), jax.nn.one_hot((best + 1) % 4, 4)
         for modality in (0, 1):
             known = known_of(UNKNOWN, np.zeros((3, 2)), modality)
-            assert policy("latent", **models)(KEY, known) == (best + modality) % 4
+            assert (
+                policy("latent", **models, q_networks=networks)(KEY, known) == (best + modality) % 4
+            )
 
 
 def test_a_dense_network_is_shown_a_poi_that_was_given_up_as_of_the_nearest_class(monkeypatch):
@@ -134,9 +128,6 @@ def test_a_policy_of_ones_own_is_one_more_entry():
     assert policies.best(table["backwards"](KEY, None, known)) == 2
     with pytest.raises(ConfigError, match=r"^policies = 'greedy': must not be latent, "):
         policies.table({"greedy": backwards})
-
-
-RULES = (policies.nearest, policies.auction, policies.gain_rate)
 
 
 def known_by(agent, times, target=None, works=None, present=None):
@@ -166,46 +157,38 @@ def choice(rule, gains, times, agent=0, **of_team):
 ALIKE = np.ones((2, 3))
 
 
-@pytest.mark.parametrize(
-    ("times", "gains", "target", "expected"),
-    [
-        ([5, 3, 9], [1, 1, 1], 3, 1),
-        ([5, 3, 9], [1, 0, 1], 3, 0),  # of PoI 1 nothing is to be learned
-        ([5, 3, 9], [0.01, -1, 5], 3, 0),  # how much counts for nothing
-        ([5, 3, 9], [1, 1, 1], 1, 0),  # the other robot heads for PoI 1
-        ([5, 3, 9], [-1, 1, 0], 1, 1),  # but nothing else is left
-        ([90, 3, 99], [1, 1, 1], 1, 0),  # 90 s are less than the 3 + 100 of what is taken
-        ([5, 3, 9], [0, -1, -2], 3, 3),  # nothing useful: NOP
-        ([5000, 3000, 9000], [1, 1, 1], 3, 1),  # however far
-    ],
-)
-def test_nearest(times, gains, target, expected):
-    found = choice(policies.nearest, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
-    assert found == expected
+NEAREST, RATE = policies.nearest, policies.gain_rate
 
 
 @pytest.mark.parametrize(
-    ("times", "gains", "target", "expected"),
+    ("rule", "times", "gains", "target", "expected"),
     [
-        ([4, 2, 8], [0.8, 0.3, 0.8], 3, 0),  # .2, .15 and .1 in a second
-        ([4, 1, 8], [0.8, 0.3, 0.8], 3, 1),  # .2, .3 and .1
-        ([4, 2, 8], [0.8, 0.3, 0.8], 0, 1),  # PoI 0 is taken: .8 / 104
-        ([4, 2, 8], [0.8, -0.3, 0.0], 0, 0),  # but nothing else is left
-        ([4, 2, 8], [-0.8, 0.0, -0.8], 3, 3),
+        (NEAREST, [5, 3, 9], [1, 1, 1], 3, 1),
+        (NEAREST, [5, 3, 9], [1, 0, 1], 3, 0),  # of PoI 1 nothing is to be learned
+        (NEAREST, [5, 3, 9], [0.01, -1, 5], 3, 0),  # how much counts for nothing
+        (NEAREST, [5, 3, 9], [1, 1, 1], 1, 0),  # the other robot heads for PoI 1
+        (NEAREST, [5, 3, 9], [-1, 1, 0], 1, 1),  # but nothing else is left
+        (NEAREST, [90, 3, 99], [1, 1, 1], 1, 0),  # 90 s are less than the 3 + 100 of what is taken
+        (NEAREST, [5, 3, 9], [0, -1, -2], 3, 3),  # nothing useful: NOP
+        (NEAREST, [5000, 3000, 9000], [1, 1, 1], 3, 1),  # however far
+        (RATE, [4, 2, 8], [0.8, 0.3, 0.8], 3, 0),  # .2, .15 and .1 in a second
+        (RATE, [4, 1, 8], [0.8, 0.3, 0.8], 3, 1),  # .2, .3 and .1
+        (RATE, [4, 2, 8], [0.8, 0.3, 0.8], 0, 1),  # PoI 0 is taken: .8 / 104
+        (RATE, [4, 2, 8], [0.8, -0.3, 0.0], 0, 0),  # but nothing else is left
+        (RATE, [4, 2, 8], [-0.8, 0.0, -0.8], 3, 3),
     ],
 )
-def test_gain_rate(times, gains, target, expected):
-    found = choice(policies.gain_rate, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target])
-    assert found == expected
+def test_choices_of_a_robot_by_its_times_and_gains(rule, times, gains, target, expected):
+    assert choice(rule, [gains, ALIKE[1]], [times, [1, 1, 1]], target=[3, target]) == expected
 
 
 def test_values_of_rules_as_worked_by_hand():
     gains, times = jnp.array([[0.8, 0.3, -1.0]]), jnp.array([[4.0, 2.0, 1.0]])
     # 1 / (1 + seconds); the auction's PoI is worth 1 more than in `nearest`.
     for rule, expected in (
-        (policies.nearest, [1 / 5, 1 / 3, -1, 0]),
+        (NEAREST, [1 / 5, 1 / 3, -1, 0]),
         (policies.auction, [1 / 5, 4 / 3, -1, 0]),
-        (policies.gain_rate, [0.2, 0.15, -1, 0]),
+        (RATE, [0.2, 0.15, -1, 0]),
     ):
         np.testing.assert_allclose(rule(gains, known_by(0, times)), expected, rtol=1e-6)
 
@@ -233,7 +216,7 @@ def test_who_has_nothing_to_learn_or_has_ended_does_not_bid():
 
 
 def test_what_a_robot_that_has_ended_headed_for_is_free():
-    for rule in (policies.nearest, policies.gain_rate):
+    for rule in (NEAREST, RATE):
         times = [[2, 4, 9], [1, 1, 1]]
         assert choice(rule, ALIKE, times, target=[3, 0]) == 1
         assert choice(rule, ALIKE, times, target=[3, 0], works=[True, False]) == 0
@@ -241,7 +224,7 @@ def test_what_a_robot_that_has_ended_headed_for_is_free():
         assert choice(rule, ALIKE, times, target=[0, 3]) == 0
 
 
-@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("rule", [NEAREST, policies.auction, RATE])
 def test_absent_pois_are_left_out(rule):
     times = [[2, 4, 9], [8, 8, 8]]
     assert choice(rule, ALIKE, times, present=[0, 1, 1]) == 1

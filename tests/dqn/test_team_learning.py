@@ -106,14 +106,13 @@ def test_without_a_look_nothing_is_lost(steps):
 
 
 def test_exploring_takes_every_poi_that_is_present_and_no_other():
-    place = learning_in(TWO)
-    state = jax.jit(place.reset)(jax.random.key(0))
+    state = jax.jit(learning_in(TWO).reset)(jax.random.key(0))
     present = jnp.array([[True, False, True], [False, False, True], [True, True, True]])
     states = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
     team = replace(states.now.team, present=present)
     states = replace(states, now=replace(states.now, team=team))
     draws = jax.random.uniform(jax.random.key(1), (600,)).at[:2].set(jnp.array([0.0, 0.9999999]))
-    of_draw = jax.jit(jax.vmap(lambda x: training._explored(place, states, jnp.full(3, x))))
+    of_draw = jax.jit(jax.vmap(lambda x: training._explored(states, jnp.full(3, x))))
     found = np.asarray(of_draw(draws))
     for column, expected in zip(found.T, ([0, 2, 3], [2, 3], [0, 1, 2, 3]), strict=True):
         assert sorted(set(column)) == expected

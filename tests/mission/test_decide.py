@@ -1,13 +1,15 @@
 """Which PoI a robot takes, by policies whose values are known."""
 
+import itertools
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from teams import LATENT, NAIVE, POSES, POSITIONS, with_values
+from teams import CONFIG, LATENT, NAIVE, POSES, POSITIONS, with_values
 
+import jaxsense
 from jaxsense.mission import decide
 from jaxsense.mission.state import DRIVING, ENDED, FACING, IDLE
 
@@ -42,13 +44,32 @@ def test_the_network_alone_chooses(chosen, set_robot, values, target):
     there = jnp.array([[0.0, 0.0, 0.0], [1.5, 0.0, jnp.pi]])
     moved = lambda s: replace(s, scene=replace(s.scene, poses=there))  # noqa: E731
     heading = lambda s: set_robot(s, 1, target=target)  # noqa: E731
-    for change in (lambda s: s, moved, heading):
+    for change in (moved, heading, lambda s: s):
         state = chosen(values, change=change)
         assert state.robots.target[0] == target
         assert state.robots.phase[0] == (ENDED if target == 3 else DRIVING)
-    state = chosen(values)
     # PoIs 0 and 1 are in view from where the robot stands: nothing to drive to.
     assert state.robots.goals[0] == (target == 2)
+
+
+def test_a_network_of_teams_chooses_by_what_the_robot_knows(decides, team, arena_of, set_robot):
+    config = replace(CONFIG, dqn=replace(CONFIG.dqn, task="team"))
+    models, taken = jaxsense.init(jax.random.key(0), config), set()
+
+    @jax.jit
+    def values_of(params, state):
+        known = decide.known_to(team, models, state, 0)
+        seen = models.agent.observe(known.belief, known.team, known.times, 0)
+        return models.agent.values(params, seen)
+
+    begun = set_robot(arena_of(POSITIONS, POSES, policy=LATENT), 1, target=1)
+    for seed, given_up in itertools.product(range(8), range(3)):
+        params = models.agent.init(jax.random.key(seed))
+        state = set_robot(begun, 0, undetected=np.arange(3) < given_up)
+        target = given_up + int(jnp.argmax(values_of(params, state)[given_up:]))
+        assert decides(replace(models, q_networks=(params,)), state).robots.target[0] == target
+        taken.add(target)
+    assert taken == {0, 1, 2, 3}
 
 
 def test_a_poi_that_was_given_up_is_left_out(chosen, set_robot):

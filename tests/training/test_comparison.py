@@ -9,10 +9,11 @@ import numpy as np
 from by_hand import CONFIG, EXACT, KEY, detections, in_place
 
 from jaxsense.config.learning import EvaluationConfig
-from jaxsense.dqn import optimum, policies
+from jaxsense.dqn import episodes, optimum, policies
 from jaxsense.dqn.optimum import LookValues
+from jaxsense.looks import Bank, mdp_of_one
+from jaxsense.models import make_bayes, make_models
 from jaxsense.training import comparison
-from jaxsense.training.comparison import held_out_mdp, models_of
 
 
 def with_bias(bias):
@@ -37,12 +38,13 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
         jax.nn.softmax(3 * jax.random.normal(k, (3, 64, 2)))
         for k in jax.random.split(jax.random.key(3))
     )
-    models = models_of(CONFIG, in_place(), (constant(1.0),) * 2, (with_bias(jnp.zeros(4)),) * 2)
+    parts = {"look_values": (constant(1.0),) * 2, "q_networks": (with_bias(jnp.zeros(4)),) * 2}
+    models = make_models(CONFIG, fusion=in_place(), **parts)
     config = replace(CONFIG, evaluation=EvaluationConfig(num_repeats=1, num_states=8))
 
     @jax.jit
     def compared(models):
-        mdp = held_out_mdp(config, models.fusion, detections(held_out=bank), 0)
+        mdp = mdp_of_one(config, models.fusion, Bank(bank), 0)
         random = jnp.zeros((4, 3), jnp.int32), jnp.zeros((4, 3, 2), bool)
         return comparison.compare_policies(KEY, models, mdp, config, random)
 
@@ -57,8 +59,9 @@ def test_policies_are_compared_on_the_same_starts_and_the_same_looks(monkeypatch
 def test_the_learned_return_is_the_mean_over_random_starts():
     @jax.jit
     def returned(bias):
-        mdp = held_out_mdp(CONFIG, in_place(), detections(held_out=EXACT), 0)
-        starts = comparison.evaluation_starts(jax.random.key(1), mdp, CONFIG)
+        mdp = mdp_of_one(CONFIG, in_place(), Bank(EXACT), 0)
+        keys = jax.random.split(jax.random.key(1), CONFIG.evaluation.num_starts)
+        starts = jax.vmap(lambda key: episodes.reset(key, mdp, make_bayes(CONFIG)))(keys)
         return comparison.evaluation(mdp, CONFIG, starts)(KEY, with_bias(bias))
 
     assert returned(jnp.array([0.0, 0.0, 0.0, 1.0])) == 0.0
