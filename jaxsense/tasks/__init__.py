@@ -8,7 +8,6 @@ from jaxsense.tasks.registry import registered as registered
 from jaxsense.tasks.score import Estimate as Estimate
 from jaxsense.tasks.score import Recurrent as Recurrent
 from jaxsense.tasks.score import Score as Score
-from jaxsense.tasks.score import greedy as greedy
 from jaxsense.tasks.score import mean_return as mean_return
 from jaxsense.tasks.score import on_host as on_host
 from jaxsense.tasks.score import score as score

@@ -16,10 +16,7 @@ from scipy import stats
 from jaxsense.config import ConfigError
 from jaxsense.config.section import require_function
 from jaxsense.core import checks
-from jaxsense.core.networks import Params
 from jaxsense.core.types import Key
-from jaxsense.dqn.agent import Agent
-from jaxsense.dqn.policies import best
 from jaxsense.tasks.registry import TASKS, as_task, reference_returns, require_unchanged
 from jaxsense.tasks.task import EPISODES, SEEDS, Act, Task, fixed_draws, key_of_seed
 
@@ -198,19 +195,6 @@ def on_host(act: Callable[[np.ndarray], np.ndarray]) -> Policy:
 
     policy.__name__ = getattr(act, "__name__", policy.__name__)  # for messages
     return policy
-
-
-@checks.typed
-def greedy(task: Task, agent: Agent, params: Params) -> Policy:
-    """Makes a policy for `score` that takes the action with the highest Q-value."""
-    return Partial(_act, task, agent, params)
-
-
-def _act(
-    task: Task, agent: Agent, params: Params, key: Key, observation: Float[Array, " S"]
-) -> Int[jax.Array, ""]:
-    del key
-    return best(agent.values(params, task.inputs(observation)))
 
 
 def estimate(values: Float[np.ndarray, " seeds"]) -> Estimate:

@@ -14,13 +14,11 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense import dqn
 from jaxsense.config.section import require_32_bits
 from jaxsense.core import checks
 from jaxsense.core.types import Key, pytree
 from jaxsense.dqn import episodes, policies, starts
 from jaxsense.dqn import mdp as mdps
-from jaxsense.dqn.agent import Agent
 from jaxsense.dqn.episodes import Start
 from jaxsense.dqn.mdp import Mdp, State
 from jaxsense.dqn.policies import Known
@@ -189,18 +187,6 @@ class Task(Environment):
     def scaled(self, features: Float[Array, "N F"]) -> Float[Array, " S"]:
         """See `Environment.scaled`."""
         return self.scaling(features)
-
-    def learning(self, agent: Agent) -> dqn.Environment:
-        """What `dqn.train` learns in with `models.agent`, perhaps with other settings."""
-        return dqn.Environment(agent, self.mdp)
-
-    def inputs(self, observation: Float[Array, " S"]) -> Float[Array, " S"]:
-        """What an agent's Q-network reads, from an observation of the task."""
-        features = self.scaling.inverse(observation)
-        if self.mdp.teams is None:
-            return features.reshape(-1)
-        # Networks ask whether a PoI's presence is above 0, which rounding must not decide.
-        return features.T.at[-3].set(jnp.round(features.T[-3])).reshape(-1)
 
     def play(self, key: Key, act: Act[M], memory: M) -> Float[Array, ""]:
         """Total reward of an episode with a policy, without discount.
