@@ -54,7 +54,7 @@ class Drives:
 
 
 Played: TypeAlias = tuple[MissionState, jax.Array]
-"""States, and the commands that the robots want."""
+"""States, and the commands of the robots at the end of each period."""
 
 Sides: TypeAlias = Callable[[Arena, Drives], list[Side]]
 """A peer's ways to make the steps of drives, each of which returns the last poses first."""

@@ -164,12 +164,12 @@ def beyond_training(config: Config) -> list[str]:
     """What missions ask of the Q-network of a team that it does not learn with; a line each."""
     if config.dqn.task == "map":
         return []
-    each, team = max(map(config.carried.count, config.carried)), config.team
     found = {
-        f"{config.arena.num_pois} PoIs": (config.arena.num_pois, team.num_pois),
-        f"an arena of {config.arena.side:g} m": (config.arena.side, team.sides),
-        f"{each} robots of a sensor": (each, (1, ROBOTS_EACH)),
+        f"{config.arena.num_pois} PoIs": (config.arena.num_pois, config.team.num_pois),
+        f"an arena of {config.arena.side:g} m": (config.arena.side, config.team.sides),
     }
+    for name, number in ((name, config.carried.count(name)) for name in config.modalities):
+        found[f"{number} robots with {name}"] = number, (1, ROBOTS_EACH)
     return [
         f"{what}: the Q-network learns with {least:g} to {most:g}"
         for what, (number, (least, most)) in found.items()

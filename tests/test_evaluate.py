@@ -157,7 +157,7 @@ def test_missions_elsewhere_have_the_settings_that_are_asked_for(capsys):
     assert elsewhere(partly, 30, 8.0).arena.num_pois == 30
     assert "30 PoIs: the Q-network learns with 3 to 8" in capsys.readouterr().err
     assert elsewhere(partly, 8, 8.0, robots=("lidar",) * 3).arena.num_pois == 8
-    assert "3 robots of a sensor: the Q-network learns with 1 to 2" in capsys.readouterr().err
+    assert "3 robots with lidar: the Q-network learns with 1 to 2" in capsys.readouterr().err
     assert not capsys.readouterr().err
     with pytest.raises(ConfigError, match=r"arena\.num_pois = 4: must be 3, as in training"):
         elsewhere(config, 4, plays=lambda n: n == 3)

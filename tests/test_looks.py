@@ -196,6 +196,7 @@ def test_missions_beyond_those_that_a_team_learns_for_are_told():
     assert looks.beyond_training(replace(team, arena=beyond, robots=("camera",) * 3)) == [
         "9 PoIs: the Q-network learns with 3 to 8",
         "an arena of 6.5 m: the Q-network learns with 3 to 6",
-        "3 robots of a sensor: the Q-network learns with 1 to 2",
+        "3 robots with camera: the Q-network learns with 1 to 2",
+        "0 robots with lidar: the Q-network learns with 1 to 2",
     ]
     assert not any(looks.beyond_training(PRESETS[name]) for name in ("team", "paper", "smoke"))

@@ -113,5 +113,5 @@ def test_another_run_is_never_overwritten(smoke_run, capsys):
 def test_what_a_run_cannot_learn_is_told(cache, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(train, "beyond_training", lambda config: ["9 PoIs: too many"])
     train.main([*SMOKE, *cache, "--out", str(tmp_path / "run"), "--mdp.min-increase", "50"])
-    told = ["9 PoIs: too many", "no look pays: lower its price, or mdp.min_increase"]
+    told = ["9 PoIs: too many", "no look pays: lower what it costs, or mdp.min_increase"]
     assert capsys.readouterr().err.splitlines() == [f"jaxsense.train: {line}" for line in told]

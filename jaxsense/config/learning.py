@@ -9,6 +9,8 @@ PROFILE = 64
 """Numbers in a LiDAR's window as a network of scans sees it, see `vae.frames`."""
 LOOKS_TOGETHER = 4
 """Looks by each sensor at a PoI in an example for a JMVAE that learns from scans."""
+LOOK_SECONDS = 0.45
+"""Duration of a robot's look, in seconds."""
 _MAX_BLOCKS = 32
 _MOST_IN_CHUNK = 100  # epochs
 _STARTS_EACH = 16
@@ -145,10 +147,6 @@ class MdpConfig(Section, place="mdp"):
         """Checks that `reward` is known or can be the name of a function; raises `ConfigError`."""
         is_named = self.reward in ("paper", "nats") or is_function_name(self.reward)
         require(is_named, self, "reward", "must be paper, nats or package.module:function")
-
-
-LOOK_SECONDS = 0.45
-"""Duration of a robot's look, in seconds."""
 
 
 class TeamConfig(Section, place="team"):

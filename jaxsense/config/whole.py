@@ -137,9 +137,9 @@ class Config(Section):
         most, is_nats = math.log(num_classes), self.mdp.reward == "nats"
         expected = f"must be below {most:.3g}, all the nats that looks can tell: none would pay"
         require(not is_nats or self.mdp.look_cost < most, self.mdp, "look_cost", expected)
-        most, is_timed = (most - self.mdp.look_cost) / LOOK_SECONDS, self.dqn.task == "team"
-        expected = f"must be below {most:.3g}: none of the nats of a look would pay for its time"
-        pays = not (is_nats and is_timed) or self.team.second_cost < most
+        is_timed, left = self.dqn.task == "team", most - self.mdp.look_cost
+        expected = f"must be below {left / LOOK_SECONDS:g}: a look tells less than its time costs"
+        pays = not (is_nats and is_timed) or self.team.second_cost * LOOK_SECONDS < left
         require(pays, self.team, "second_cost", expected)
         adds_up = jmvae.fusion == "filter" or not self.mission.communication.own_maps
         expected = "must be off unless jmvae.fusion is 'filter', which accumulates looks"

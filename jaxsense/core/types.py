@@ -196,7 +196,7 @@ class Transition:
 
 
 def within_a_turn(angle: jax.Array) -> jax.Array:
-    """Angles in radians, turned to where they are from -pi to pi."""
+    """Angles wrapped to -pi to pi, in radians."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 

@@ -11,10 +11,10 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from jaxsense.core.networks import Dense
-from jaxsense.dqn.team import Travel
 
 _REACHES = (2.0, 6.0)  # s, within which PoIs count as near
-_VIEW = 0.9  # m, from which robots see a PoI
+# Those with which the networks that ship have learned.
+_SPEED, _TURN_RATE, _VIEW = 0.2, 1.0, 0.9  # m/s, rad/s and m
 _MESSAGES = 8
 _NOTHING = -1e6  # value of a PoI that is not present
 
@@ -81,4 +81,4 @@ def _seconds_between(place: jax.Array) -> jax.Array:
     ahead = jnp.sum(path * course[:, :, None], axis=0) / length
     # From 0 for straight on to a half turn, without the cost of an arc cosine.
     turn = jnp.pi / 2 * (1.0 - ahead)
-    return turn / Travel.turn_rate + jnp.maximum(length - _VIEW, 0.0) / Travel.speed
+    return turn / _TURN_RATE + jnp.maximum(length - _VIEW, 0.0) / _SPEED

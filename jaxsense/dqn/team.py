@@ -186,7 +186,7 @@ class Travel:
         return turn, straight, to_place / jnp.maximum(distance, 1e-6)
 
 
-NO_TRAVEL = Travel(view_distance=0.0, speed=1e30, turn_rate=1e30, look_seconds=1.0)
+NO_TRAVEL = Travel(view_distance=jnp.inf, speed=1e30, turn_rate=1e30, look_seconds=1.0)
 """Of a robot that does not travel: a look takes one second, from anywhere."""
 
 

@@ -14,8 +14,10 @@ from jaxtyping import PyTree
 
 from jaxsense import mission
 from jaxsense.config import Config
+from jaxsense.config.learning import LOOK_SECONDS
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
+from jaxsense.dqn.optimum import LookValues
 from jaxsense.dqn.policies import Values
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
@@ -196,9 +198,6 @@ def learn(key: Key, programs: Programs, checkpoints: Checkpoints) -> TrainingRes
     measured, reliability = jax.tree.map(np.asarray, outputs["detector_metrics"])
     detections = jax.tree.map(np.asarray, outputs["detections"])
     beliefs: blocks.Beliefs = make.plain(dict(outputs["beliefs"]))
-    tables = [np.append(values.q, values.q_unseen) for values in outputs["look_values"]]
-    if not np.any(np.concatenate(tables) > 0):
-        programs.monitor.warn("no look pays: lower its price, or mdp.min_increase")
     is_sound = compare.unsound(beliefs) is None
 
     def agent(modality: str, values: Output) -> blocks.Agent:
@@ -309,6 +308,8 @@ class _Training:
                 self.checkpoints.save(f"curves_{stage.name}", self.curves[stage.name])
             if is_saved:
                 self.checkpoints.save(stage.name, output)
+            if stage.name == "look_values":
+                self._check_prices(output)
             return output
         except BaseException as error:
             if not isinstance(error, Stopped):
@@ -333,6 +334,13 @@ class _Training:
                 raise StageError(told)
             self.programs.monitor.warn(f"{told}: left out")
         return output
+
+    def _check_prices(self, values: tuple[LookValues, ...]) -> None:
+        """Tells if no look is worth what it costs."""
+        config = self.programs.config
+        cost = config.team.second_cost * LOOK_SECONDS if config.dqn.task == "team" else 0.0
+        if max(np.max(np.append(each.q, each.q_unseen)) for each in values) <= cost:
+            self.programs.monitor.warn("no look pays: lower what it costs, or mdp.min_increase")
 
     def _begin(self, stage: Stage, inputs: dict[str, Output]) -> Output:
         """The first state."""

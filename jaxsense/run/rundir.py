@@ -283,7 +283,7 @@ def rewards(
       warn: called with a line about each checkpoint that is damaged or missing.
 
     Returns:
-      `[K, epochs]` rewards as in `pipeline.TrainingResults`, without those of such checkpoints.
+      `[K, epochs]` rewards of `pipeline.TrainingResults`, without those of such checkpoints.
     """
     epochs = config.dqn.epochs
     lengths = dict.fromkeys(("reward", "evaluation", "epsilon"), epochs)

@@ -117,8 +117,8 @@ def score_missions(
         expected = "must be the number of PoIs that the models were trained with"
         raise ConfigError("arena.num_pois", number, expected)
     require_fitting(config, models)
-    for what in beyond_training(config):
-        warnings.warn(what, stacklevel=2)
+    for what in beyond_training(config) if "latent" in (*policies, *against) else ():
+        warnings.warn(what, stacklevel=3)  # past the check of types
     own = {
         name: each if name in POLICIES else _checked(name, each) for name, each in policies.items()
     }

@@ -12,6 +12,7 @@ from jax.tree_util import Partial
 
 import jaxsense
 from benchmarks import dqn, peers, scoreboard
+from jaxsense.dqn import Environment
 
 make = functools.cache(jaxsense.make)
 
@@ -38,6 +39,21 @@ def test_our_dqn_trains_in_every_kind_of_task(name, monkeypatch):
     one, other = (jax.tree.leaves(policies[seed]) for seed in (20, 21))
     assert any((np.asarray(x) != np.asarray(y)).any() for x, y in zip(one, other, strict=True))
     assert not draws(policies[20], name)
+
+
+def test_our_dqn_takes_the_best_action_of_what_it_learned_from():
+    task, agent = make("team-v0"), make("team-v0").models.agent
+    params, learning = agent.init(jax.random.key(1)), Environment(agent, task.mdp)
+
+    @jax.vmap
+    def start(key):
+        state = learning.reset(key)
+        values = agent.values(params, learning.observe(state))
+        return dqn._act(task, agent, params, key, task.observe(state.now)), jnp.argmax(values)
+
+    chosen, best = jax.jit(start)(jax.random.split(jax.random.key(2), 64))
+    np.testing.assert_array_equal(chosen, best)
+    assert len(set(best.tolist())) > 2
 
 
 @pytest.mark.slow

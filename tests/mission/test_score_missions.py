@@ -91,5 +91,8 @@ def test_a_policy_without_a_value_for_each_action_is_named(values):
 
 def test_missions_that_the_network_did_not_learn_for_are_told(play, monkeypatch):
     monkeypatch.setattr(score, "beyond_training", lambda config: ["9 PoIs: too many"])
-    with pytest.warns(UserWarning, match="^9 PoIs: too many$"):
-        play({}, against=["naive"], episodes=4)
+    monkeypatch.setitem(FOUND, "latent", FOUND["naive"])
+    with pytest.warns(UserWarning, match="^9 PoIs: too many$") as told:
+        play({}, against=["latent"], episodes=4)
+    play({}, against=["naive"], episodes=4)
+    assert [each.filename for each in told] == [__file__]
