@@ -14,10 +14,10 @@ from jaxsense.config import Config
 from jaxsense.mission import MissionState
 from jaxsense.mission.rollout import rollout_batch
 from jaxsense.run import devices
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.missions import Played, Player
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import Compiler
 
 _UNIT = "control-steps/s"
 # For each accelerator.

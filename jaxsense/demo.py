@@ -11,9 +11,9 @@ from jaxsense import mission
 from jaxsense.config.options import command
 from jaxsense.config.section import Checked, limited
 from jaxsense.run import cli, devices, files, missions, output, rundir
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
-from jaxsense.run.programs import Compiler
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import film, page
 from jaxsense.show.terminal import Display

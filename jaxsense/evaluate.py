@@ -12,11 +12,11 @@ from jaxsense.config.mission import MAX_EPISODES
 from jaxsense.config.options import Positional
 from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.run import cli, devices, files, missions, output, rundir
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor
 from jaxsense.run.output import say
-from jaxsense.run.pipeline import OwnPolicies
-from jaxsense.run.programs import Compiler
+from jaxsense.run.programs import OwnPolicies
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.show import drawing, film, page, plots
 from jaxsense.show.terminal import Display

@@ -23,11 +23,11 @@ from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.looks import beyond_training
 from jaxsense.mission.outcome import require_playable
 from jaxsense.run import cli, devices, output, pipeline, rundir
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import MAX_DEVICES
 from jaxsense.run.monitor import Monitor, StageError, Stopped
 from jaxsense.run.output import on_interrupt, say
-from jaxsense.run.pipeline import OwnPolicies, Programs
-from jaxsense.run.programs import Compiler
+from jaxsense.run.programs import OwnPolicies, Programs
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import Settings, read_settings, resumable
 from jaxsense.show import terminal

@@ -6,9 +6,9 @@ import jax
 import pytest
 
 from jaxsense.config import PRESETS
+from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.pipeline import Programs
-from jaxsense.run.programs import Compiler, Program
+from jaxsense.run.programs import Programs
 
 
 @pytest.mark.slow  # traces everything twice

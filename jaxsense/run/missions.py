@@ -21,9 +21,9 @@ from jaxsense.mission.rollout import rollout_batch
 from jaxsense.mission.state import Faults, no_faults
 from jaxsense.models import Models, init
 from jaxsense.run import devices
+from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import StageError, is_finite
-from jaxsense.run.programs import Compiler, Program
 from jaxsense.summary.compare import Measured
 
 _STAGE = "mission"  # name of the programs in profiles and caches

@@ -1,30 +1,24 @@
-"""A whole run: compiles programs, trains stage after stage, plays the missions, and summarises."""
+"""A whole run: trains stage after stage, plays the missions, and summarises both."""
 
 import dataclasses
-import threading
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
 from jaxsense import mission
-from jaxsense.config import Config
 from jaxsense.config.learning import LOOK_SECONDS
 from jaxsense.core.types import Belief, Key, Reliability
 from jaxsense.dqn.episodes import has_optimum
 from jaxsense.dqn.optimum import LookValues
-from jaxsense.dqn.policies import Values
 from jaxsense.models import Models
 from jaxsense.run import devices, missions
-from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.files import UNFINISHED, Checkpoints
 from jaxsense.run.monitor import StageError, Stopped, is_finite
-from jaxsense.run.programs import Compiler, Program, RowProgram
+from jaxsense.run.programs import Programs
 from jaxsense.sim import sensors
 from jaxsense.summary import blocks, compare, make
 from jaxsense.training import stages
@@ -33,139 +27,11 @@ from jaxsense.training.stage import Output, Progress, Stage, key_of
 
 Curves = dict[str, np.ndarray]
 """`[steps]` of each metric of a training, and `[chunks]` `seconds`; NaN where it has not been."""
-OwnPolicies = Mapping[str, Values]
-"""Policies of a user, by name, see `dqn.policies.table`."""
 
-_BEFORE_MISSIONS = 2  # stages that all others wait for
-_HAS_ROWS = ("survey",)  # whose inputs and outputs are independent rows, which workers share
 _SAVE_PERIOD = 60.0  # s
 _MAX_THREADS = 64  # stages that run or wait at once
 _ONLY_PASSED_ON = ("scenes", "survey", "examples", "views")  # let go of once no stage needs them
 _SAVED = ("best_jmvae", "class_beliefs", "fusion", "look_values", "novelty")  # beside trainings
-
-
-class StagePrograms(NamedTuple):
-    """The programs of a stage, see `Stage`; without steps, the first alone is compiled.
-
-    Attributes:
-      output: shapes and dtypes of the stage's output.
-      metrics: names of the metrics of its steps.
-    """
-
-    begin: Program | RowProgram
-    advance: Program
-    finish: Program
-    output: Output
-    metrics: tuple[str, ...]
-
-
-class Programs:
-    """Compiled programs of the runs of one or several seeds: of every stage, and of the missions.
-
-    A thread traces them one after the other. Each compiles as soon as it is traced, while stages
-    with compiled programs already run. Shapes come from tracing: a stage's outputs are later
-    stages' inputs.
-    """
-
-    def __init__(
-        self,
-        config: Config,
-        compiler: Compiler,
-        workers: Workers = ALONE,
-        trainings: int = 0,
-        policies: OwnPolicies | None = None,
-    ):
-        """Starts to trace and compile in the background.
-
-        Args:
-          workers: share rows and missions.
-          trainings: number after whose last call a program is released; 0 for never.
-          policies: of missions, by name, in addition to `dqn.POLICIES`.
-        """
-        self.config, self.stages, self.monitor = config, stages.stages(config), compiler.monitor
-        self.player: Future[missions.Player] = Future()
-        self._compiler, self._workers, self._policies = compiler, workers, policies
-        names = [stage.program for stage in self.stages]
-        self._of = {name: Future[StagePrograms]() for name in names}
-        self._left, self._lock = Counter(trainings * names), threading.Lock()
-        threading.Thread(target=self._trace, name="trace").start()
-
-    def of(self, stage: Stage) -> StagePrograms:
-        """The programs of a stage, once they are traced."""
-        return self.monitor.wait_for(self._of[stage.program])
-
-    def used(self, stage: Stage) -> None:
-        """Notes that a training is done with a stage, and lets go of programs that none needs."""
-        with self._lock:
-            self._left[stage.program] -= 1
-            if self._left[stage.program] == 0:
-                before, self._of[stage.program] = self._of[stage.program], Future()
-                if before.done():
-                    for program in before.result()[:3]:
-                        program.cancel()
-
-    def _trace(self) -> None:
-        """Traces all programs."""
-        # Missions come last, but take a CPU longest to compile. With an accelerator, cores are
-        # free to compile, and everything waits for tracing.
-        left = [stage.name for stage in self.stages[_BEFORE_MISSIONS:]] if _on_cpu() else []
-
-        def drive(stage: Stage, **inputs: Output) -> Output:
-            if left[:1] == [stage.name]:
-                self._compile_missions()
-            return self._compile(stage, inputs)
-
-        try:
-            stages.train(drive, self.config)
-            if not left:
-                self._compile_missions()
-        except BaseException as error:
-            self.monitor.fail(error)
-
-    def _compile_missions(self) -> None:
-        config = self.config
-        with self.monitor.measure("compile_s", "mission"):
-            scenario = mission.make_mission(config, self._policies)
-            scenario = scenario.playing(config.mission.policies)
-        number = len(config.mission.policies) * config.mission.episodes
-        player = missions.Player(scenario, self._compiler, number, self._workers)
-        self.player.set_result(player)
-
-    def _compile(self, stage: Stage, inputs: dict[str, Output]) -> Output:
-        """Shapes of a stage's output; compiles its programs unless an earlier stage shares them."""
-        name, key, config = stage.program, jax.random.key(0), self.config
-        if (before := self._of[name]).done():
-            return before.result().output
-
-        def first(key: Key, config: Config, inputs: dict[str, Output]) -> Output:
-            return stage.begin(key, config, **inputs)
-
-        def last(config: Config, state: Output, inputs: dict[str, Output]) -> Output:
-            return stage.finish(config, state, **inputs)
-
-        begin, advance, finish = (
-            Program(self._compiler, name, part) for part in ("begin", "advance", "finish")
-        )
-        if name in _HAS_ROWS and (_on_cpu() or self._workers.mesh is not None):
-            begin = RowProgram(begin, self._workers)
-        state = begin.compile(first, key, config, inputs, whole=2)
-        if (step := stage.advance) is None:
-            output, metrics = jax.eval_shape(lambda *args: last(config, *args), state, inputs), ()
-        else:
-
-            def chunk(key: Key, config: Config, state: Output, inputs: dict[str, Output]) -> Output:
-                return step(key, config, state, **inputs)
-
-            _, progress = advance.compile(chunk, key, config, state, inputs)
-            output = finish.compile(last, config, state, inputs)
-            metrics = tuple(progress.metrics)
-        self._of[name].set_result(StagePrograms(begin, advance, finish, output, metrics))
-        return output
-
-
-def _on_cpu() -> bool:
-    """Whether the programs run on a CPU; accelerators train faster than they compile."""
-    return jax.default_backend() == "cpu"
 
 
 @dataclasses.dataclass(frozen=True)

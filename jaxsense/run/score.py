@@ -18,9 +18,9 @@ from jaxsense.looks import beyond_training
 from jaxsense.mission import cases, make_mission
 from jaxsense.models import Models, require_fitting
 from jaxsense.run import devices, missions
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import ALONE, Workers
 from jaxsense.run.monitor import Listener, Monitor
-from jaxsense.run.programs import Compiler
 from jaxsense.run.settings import MAX_SEED
 from jaxsense.summary import make
 from jaxsense.summary.blocks import MISSIONS, Case

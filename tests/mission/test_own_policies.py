@@ -11,9 +11,9 @@ from jaxsense import evaluate, mission, train
 from jaxsense.config import ConfigError
 from jaxsense.mission.outcome import require_playable
 from jaxsense.mission.state import DRIVING, FAILED
-from jaxsense.run import output, pipeline
+from jaxsense.run import output, programs
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Compiler
 
 
 def last_first(key, models, known):
@@ -102,9 +102,9 @@ def test_train_passes_own_policies_on_and_keeps_no_programs(tmp_path, monkeypatc
 
 def test_own_policies_reach_the_programs_of_a_run(monkeypatch):
     played = lambda mission, compiler, total, workers: mission  # noqa: E731
-    monkeypatch.setattr(pipeline.missions, "Player", played)
-    monkeypatch.setattr(pipeline.stages, "train", lambda drive, config: None)
-    made = pipeline.Programs(playing("mine"), Compiler(Monitor()), policies=OWN)
+    monkeypatch.setattr(programs.missions, "Player", played)
+    monkeypatch.setattr(programs.stages, "train", lambda drive, config: None)
+    made = programs.Programs(playing("mine"), Compiler(Monitor()), policies=OWN)
     assert [*made.player.result().policies] == ["mine"]
     with pytest.raises(ConfigError, match=r"mission\.policies = \('mine',\): must be among"):
         require_playable(playing("mine"))

@@ -14,9 +14,9 @@ from jaxsense import mission
 from jaxsense.core.types import Belief
 from jaxsense.mission.state import Record
 from jaxsense.run import devices, missions
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.devices import Workers
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.programs import Compiler
 
 # The package gives its function this name.
 ROLLOUT = importlib.import_module("jaxsense.mission.rollout")

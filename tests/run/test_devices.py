@@ -16,10 +16,10 @@ from smoke import SMOKE, error_line, without_times
 from jaxsense import train
 from jaxsense.config import PRESETS, ConfigError
 from jaxsense.run import devices
+from jaxsense.run.compilation import Compiler, Program, RowProgram
 from jaxsense.run.devices import Workers
 from jaxsense.run.kept import Kept, trace
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import Compiler, Program, RowProgram
 from jaxsense.sim import arena as arenas
 
 CONFIG = PRESETS["smoke"]

@@ -18,9 +18,9 @@ import jaxsense
 from jaxsense.config import PRESETS, SensorConfig
 from jaxsense.core.types import Belief, pytree
 from jaxsense.run import cli, version
+from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.kept import _MAX_BYTES, Kept, use_cache
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.programs import Compiler, Program
 
 ONE = jnp.float32(1)
 
@@ -137,7 +137,7 @@ FACTORS = """
 import sys
 from pathlib import Path
 import jax, jax.numpy as jnp
-from jaxsense.run.programs import Compiler, Program
+from jaxsense.run.compilation import Compiler, Program
 from jaxsense.run.kept import Kept
 from jaxsense.run.monitor import Monitor
 

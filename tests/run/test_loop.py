@@ -15,10 +15,10 @@ import pytest
 
 from jaxsense.config import PRESETS
 from jaxsense.run import devices, pipeline
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor, StageError, Stopped
-from jaxsense.run.pipeline import Programs
-from jaxsense.run.programs import Compiler
+from jaxsense.run.programs import Programs
 from jaxsense.training import stages
 from jaxsense.training.stage import Progress, Stage
 

@@ -11,7 +11,7 @@ from smoke import error_line, interrupting, without_times
 
 import jaxsense
 from jaxsense import evaluate, train
-from jaxsense.run.programs import RowProgram
+from jaxsense.run.compilation import RowProgram
 from jaxsense.run.rundir import RunDirectory
 from jaxsense.run.settings import read_settings
 

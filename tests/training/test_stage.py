@@ -10,10 +10,10 @@ from tiny import KEY, TINY, stage_of
 
 from jaxsense import training
 from jaxsense.run import pipeline
+from jaxsense.run.compilation import Compiler
 from jaxsense.run.files import Checkpoints
 from jaxsense.run.monitor import Monitor
-from jaxsense.run.pipeline import Programs
-from jaxsense.run.programs import Compiler
+from jaxsense.run.programs import Programs
 from jaxsense.training import learn
 from jaxsense.training.stage import Progress, Stage, key_of, scan
 
