@@ -1,5 +1,8 @@
 """Fixtures of arenas, for the tests of the simulation and of missions."""
 
+import copy
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,7 +11,7 @@ import pytest
 
 from jaxsense import sim
 from jaxsense.config.scene import ArenaConfig
-from jaxsense.sim.arena import build
+from jaxsense.sim.arena import build, sized
 
 
 @pytest.fixture(scope="session")
@@ -35,6 +38,13 @@ def set_native(arena):
         return mj_data
 
     return native
+
+
+def natively_sized(arena, layout):
+    """The arena in whose C MuJoCo inner walls are as long as in a layout."""
+    model = copy.copy(arena.mj_model)
+    model.geom_size[:] = sized(arena, layout).model.geom_size
+    return dataclasses.replace(arena, mj_model=model)
 
 
 @pytest.fixture(scope="session")

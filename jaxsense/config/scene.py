@@ -28,6 +28,9 @@ LIDAR_HEIGHT = 0.152
 POI_HEIGHT = 0.2
 """Height of a PoI, in metres; beams and cameras must not look over it."""
 
+WALL_HEIGHT, WALL_THICKNESS = 0.3, 0.05
+"""Height and thickness of walls, in metres."""
+
 MAX_BEARING = 20.0
 """Largest angle between a robot's heading and the PoI that it looks at, to either side, in
 degrees."""
@@ -121,7 +124,10 @@ class ArenaConfig(Section, place="arena"):
 
     Attributes:
       side: Inner length and width of the arena, in metres.
-      num_pois: Number of points of interest.
+      num_pois: Number of points of interest, or the largest one.
+      fewest_pois: Smallest number of points of interest, from which to `num_pois` each arena's
+        number is drawn; 0 for always `num_pois`.
+      inner_walls: Number of walls inside the arena, at random places; one without room is left out.
       poi_radius: Radius of a cylinder and half the side of a cube, in metres; unit of the sides of
         custom shapes.
       poi_gap: Minimum gap between two PoIs, in metres; a robot needs 0.1 to pass.
@@ -134,6 +140,8 @@ class ArenaConfig(Section, place="arena"):
 
     side: float = limited(3.0, above=0, at_most=100)
     num_pois: int = limited(3, at_least=1, at_most=64)
+    fewest_pois: int = limited(0, at_least=0)
+    inner_walls: int = limited(0, at_least=0, at_most=16)
     poi_radius: float = limited(0.1, above=0)
     poi_gap: float = limited(0.3, above=0)
     classes: tuple[str, ...] = limited(("green cylinder", "red cylinder", "red cube"), min_items=2)
@@ -163,6 +171,8 @@ class ArenaConfig(Section, place="arena"):
             else "no PoI fits; lower arena.poi_gap or arena.poi_radius, or raise arena.side"
         )
         require(self.num_pois <= most, self, "num_pois", expected)
+        expected = f"must be at most num_pois = {self.num_pois}"
+        require(self.fewest_pois <= self.num_pois, self, "fewest_pois", expected)
 
     def _check_classes(self) -> None:
         """Classes must consist of known words, and differ in what sensors measure."""

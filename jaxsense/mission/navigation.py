@@ -5,6 +5,7 @@ and that keep clear of walls, PoIs and other robots, a robot takes the one that 
 goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import chex
@@ -17,7 +18,7 @@ from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.config.scene import ArenaConfig
 from jaxsense.core.types import Index, others, product
 from jaxsense.sim import amiro
-from jaxsense.sim.arena import Layout
+from jaxsense.sim.arena import Layout, room_beside, to_box
 
 _BACKWARD_SPEED = 0.1  # m/s
 _HORIZON = 2.0  # s, length of a trajectory
@@ -75,19 +76,17 @@ def clearance(
     chex.assert_shape(poses, (None, 3))
     x, y = poses[:, :1], poses[:, 1:2]
     to_wall = arena.side / 2 - jnp.max(jnp.abs(poses[:, :2]), axis=-1)
+    if len(layout.walls):
+        to_wall = jnp.minimum(to_wall, room_beside(layout.walls, poses[:, 0], poses[:, 1]))
 
     shapes = arena.shapes.values()
     half_sides = arena.poi_radius * jnp.array([shape.half_sides for shape in shapes])
     is_round = jnp.array([shape.is_round for shape in shapes])[layout.shape]
     half_u, half_v = half_sides[layout.shape].T
     from_x, from_y = x - layout.position[None, :, 0], y - layout.position[None, :, 1]
-    cos, sin = jnp.cos(layout.yaw)[None], jnp.sin(layout.yaw)[None]
-    along = jnp.abs(cos * from_x + sin * from_y) - half_u[None]
-    across = jnp.abs(cos * from_y - sin * from_x) - half_v[None]
-    outside = jnp.hypot(jnp.maximum(along, 0.0), jnp.maximum(across, 0.0))
-    to_box = outside + jnp.minimum(jnp.maximum(along, across), 0.0)
-    to_cylinder = jnp.hypot(from_x, from_y) - half_u[None]
-    to_poi = jnp.min(jnp.where(is_round[None], to_cylinder, to_box), axis=-1)
+    from_box = to_box(from_x, from_y, layout.yaw[None], half_u[None], half_v[None])
+    from_cylinder = jnp.hypot(from_x, from_y) - half_u[None]
+    to_poi = jnp.min(jnp.where(is_round[None], from_cylinder, from_box), axis=-1)
 
     apart = jnp.hypot(x - x.T, y - y.T) - amiro.BODY_RADIUS
     to_robot = jnp.min(jnp.where(jnp.eye(len(poses), dtype=bool), jnp.inf, apart), axis=-1)
@@ -118,6 +117,7 @@ def drive_to(
     waypoint: Float[Array, "2"],
     seconds: float,
     backs_off: Bool[Array, ""],
+    walls: Float[Array, "K 4"] | None = None,
 ) -> Float[Array, "2"]:
     """Command that brings a robot to a waypoint soonest without touching anything.
 
@@ -131,7 +131,9 @@ def drive_to(
     Args:
       waypoint: in metres.
       seconds: how long the robot keeps the command.
+      walls: inner walls that the robot knows of, see `Layout`; by default those of the layout.
     """
+    layout = layout if walls is None else dataclasses.replace(layout, walls=walls)
     chex.assert_shape([waypoint, poses, commands], [(2,), (None, 3), (len(poses), 2)])
     pose, present = poses[robot], commands[robot]
     arcs, cos, sin = _arcs(present[1], seconds), jnp.cos(pose[2]), jnp.sin(pose[2])
@@ -145,6 +147,10 @@ def drive_to(
     x, y = pose[0] + cos * arcs.x - sin * arcs.y, pose[1] + sin * arcs.x + cos * arcs.y
     to_wall = arena.side / 2 - jnp.maximum(jnp.abs(x), jnp.abs(y)) - PLANNING_RADIUS
     to_wall_now = arena.side / 2 - jnp.max(jnp.abs(pose[:2])) - PLANNING_RADIUS
+    if len(layout.walls):
+        to_wall = jnp.minimum(to_wall, room_beside(layout.walls, x, y) - PLANNING_RADIUS)
+        beside_now = room_beside(layout.walls, pose[0], pose[1]) - PLANNING_RADIUS
+        to_wall_now = jnp.minimum(to_wall_now, beside_now)
     keep, (poi_x, poi_y) = arena.poi_extent + PLANNING_RADIUS, in_frame(layout.position)
     map_room = jnp.minimum(to_wall, _to_nearest(arcs, poi_x[:, None], poi_y[:, None]) - keep)
     map_room_now = jnp.minimum(to_wall_now, jnp.min(jnp.hypot(poi_x, poi_y)) - keep)
@@ -239,6 +245,8 @@ def sidestep(
         to_pois = jnp.linalg.norm(sides[:, None] - layout.position[None], axis=-1)
         has_room = jnp.all(to_pois >= arena.poi_extent + PLANNING_RADIUS, axis=-1)
         has_room &= jnp.max(jnp.abs(sides), axis=-1) <= reach
+        if len(layout.walls):
+            has_room &= room_beside(layout.walls, *sides.T) >= PLANNING_RADIUS
         detour = jnp.linalg.norm(sides - waypoint[None], axis=-1) + jnp.array([0.0, 0.05])
         best = jnp.argmin(jnp.where(has_room, detour, jnp.inf))
         return sides[best], blocks & jnp.any(has_room)

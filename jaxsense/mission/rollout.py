@@ -234,7 +234,9 @@ def _integrate(
 
     placed = jax.vmap(place_pois)(layout, motion.poses)
 
-    def step(motion: _Motion, wanted: jax.Array, placed: tuple[jax.Array, jax.Array]) -> _Motion:
+    def step(
+        motion: _Motion, wanted: jax.Array, placed: tuple[jax.Array, jax.Array], layout: Layout
+    ) -> _Motion:
         """Makes one physics step of one mission."""
         command = navigation.ramp(motion.command, wanted, arenas.TIMESTEP)
         data: mjx.Data = arena.data.replace(
@@ -244,7 +246,8 @@ def _integrate(
             qvel=motion.velocity.reshape(-1),
             qacc_warmstart=motion.warmstart,
         )
-        data = arenas.drive(arena, data, navigation.wheel_speeds(command))
+        sized = arenas.sized(arena, layout)
+        data = arenas.drive(sized, data, navigation.wheel_speeds(command))
         return _Motion(
             poses=arenas.robot_poses(data),
             velocity=data.qvel.reshape(-1, 3),
@@ -254,7 +257,7 @@ def _integrate(
 
     def substep(motion: _Motion, _) -> tuple[_Motion, Float[Array, " B"]]:
         # The batch inside the loop: a loop inside a batch is traced over and over.
-        after = jax.vmap(step)(motion, wanted, placed)
+        after = jax.vmap(step)(motion, wanted, placed, layout)
         with jax.named_scope("mission.clearance"):
             around = functools.partial(navigation.clearance, arena.config)
             return after, jnp.min(jnp.minimum(*jax.vmap(around)(layout, after.poses)), axis=-1)

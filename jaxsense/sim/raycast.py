@@ -139,6 +139,7 @@ def cross_section(
     Wheels and casters are left out: at the height of a sensor they are inside the robot's cylinder.
 
     Args:
+      arena: with inner walls `sized` for the layout.
       data: the arena's MJX state, with up-to-date `geom_xpos` and `geom_xmat`.
       robot: index of the robot whose geoms to omit, because it is looking; -1 for none.
     """

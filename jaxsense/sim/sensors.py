@@ -23,7 +23,7 @@ from jaxsense.config.section import named_function
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, is_static, pytree
 from jaxsense.sim import amiro, raycast
-from jaxsense.sim.arena import Arena, Layout, robot_poses
+from jaxsense.sim.arena import Arena, Layout, robot_poses, sized
 from jaxsense.sim.light import Light, lighting
 from jaxsense.sim.raycast import Fan, Pinhole, Rays
 
@@ -332,7 +332,7 @@ def scan(
     """
     checks.require_key(key)
     chex.assert_shape(directions, (2, None))
-    pose = robot_poses(data)[robot]
+    arena, pose = sized(arena, layout), robot_poses(data)[robot]
     section = _section(arena, data, sensor.height, robot, twin)
     x, y = directions
     in_world = raycast.turned((x, y), pose[2])

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 from jaxsense.config.scene import ArenaConfig, ViewpointConfig
 from jaxsense.core.types import Index, Key, pytree, within_a_turn
 from jaxsense.sim import amiro
-from jaxsense.sim.arena import Layout
+from jaxsense.sim.arena import Layout, room_beside
 from jaxsense.sim.sensors import Sensor
 
 _ABSENT = {"empty": 2, "wall": 3, "outside": 1, "off": 2, "covered": 2, "robot": 3}  # shares
 _MIN_DISTANCE = 0.12  # m, between the centres of two robots
+_VIEW_SAMPLES = 33  # of a view; closer to each other than walls are thick up to 1.6 m
 
 
 def bearing(
@@ -53,6 +54,13 @@ def free_room(
     target = layout.position[poi]
     view_x, view_y = target[0] - x, target[1] - y
     view_length = jnp.sqrt(view_x**2 + view_y**2)
+    if len(layout.walls):
+        to_wall = jnp.minimum(to_wall, room_beside(layout.walls, x, y) - reach)
+        shares = jnp.linspace(0.0, 1.0, _VIEW_SAMPLES)[:, None]
+        beside = room_beside(
+            layout.walls, x[None] + shares * view_x[None], y[None] + shares * view_y[None]
+        )
+        to_wall = jnp.minimum(to_wall, jnp.min(beside - shares * arena.poi_extent, axis=0))
 
     def around(room: jax.Array, obstacle: tuple[jax.Array, jax.Array]):
         centre, radius = obstacle

@@ -16,7 +16,7 @@ FREE_TOLERANCE = 2e-5  # m, rad, m/s and rad/s, over 2 s of float32 against floa
 def driver(arena):
     def run(layout, poses, wheel_speeds):
         def step(data, speeds):
-            data = arenas.drive(arena, data, speeds)
+            data = arenas.drive(arenas.sized(arena, layout), data, speeds)
             return data, (data.qpos, data.qvel, data.geom_xpos, data.geom_xmat)
 
         start = sim.place(arena, layout, poses)
