@@ -1,4 +1,5 @@
 from . import dqn as dqn
+from . import exploration as exploration
 from . import interfaces as interfaces
 from . import mission as mission
 from . import recorded as recorded

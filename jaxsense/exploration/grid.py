@@ -35,7 +35,7 @@ _BEYOND, _CROSSED = 0.02, 0.05
 _WIDTH = 0.2  # of a cell, least surface that beams measure in an occupied one: fewer are noise
 _HIT, _MOST = 2, 4  # evidence of a scan in units of a crossing, and most evidence
 _NEAREST = 0.45  # m to the cell that stands for a place in an obstacle's margin
-_OBSTACLE_COST = 0.25  # of a length, next to cells that are not passable
+_OBSTACLE_COST = 3.0  # of a length, next to cells that are not passable
 _WAY, _CENTRED = 1.0, 0.05  # m to the farthest waypoint, and to a cell that a robot has reached
 _SAMPLES, _BESIDE = 16, 0.08  # of a straight line, and m beside it that are free
 _SPACING, _VIEW = 1.0, 0.75  # m between frontiers, and of the floor that belongs to one
@@ -201,7 +201,7 @@ def is_passable(grid: Grid, blocked: Float[Array, "P 3"]) -> Cells:
 def distances(grid: Grid, start: Place, blocked: Float[Array, "P 3"]) -> Lengths:
     """Lengths of the shortest 8-connected paths from a start over passable cells.
 
-    Paths cut no corner, and count a quarter longer next to cells that are not passable. They are
+    Paths cut no corner, and count four times next to cells that are not passable. They are
     as long there as back. If the start is not passable, they begin at the nearest cell that is,
     up to .45 m away.
 

@@ -5,13 +5,13 @@ update the slots, `merged` unites two slots of one object, and `gospa` scores th
 """
 
 import dataclasses
-from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.core.types import Belief, T, product, pytree
+from jaxsense.exploration.proposals import Candidates
 from jaxsense.mission.state import RECENT_LOOKS
 from jaxsense.models import Models
 
@@ -25,20 +25,6 @@ _SURE = 3.0  # log-odds; slots below its negative are cleared
 
 
 Number = Float[Array, ""] | float
-
-
-class Located(Protocol):
-    """Protocol of C candidates from one scan, in the frame of the map.
-
-    Attributes:
-      position: centres, in metres.
-      covariance: of the position, in square metres.
-      is_valid: which rows are candidates.
-    """
-
-    position: Float[Array, "C 2"]
-    covariance: Float[Array, "C 2 2"]
-    is_valid: Bool[Array, " C"]
 
 
 @pytree
@@ -128,7 +114,7 @@ def found(slots: Slots) -> Bool[Array, " S"]:
     return slots.is_used & (slots.existence >= _SURE)
 
 
-def associate(slots: Slots, candidates: Located, radius: Number) -> Association:
+def associate(slots: Slots, candidates: Candidates, radius: Number) -> Association:
     """Assigns all candidates of a scan at once, with the largest likelihood by an auction.
 
     A candidate may be of a slot within the gate, or of one so near that two bodies would overlap.
@@ -158,7 +144,11 @@ def associate(slots: Slots, candidates: Located, radius: Number) -> Association:
 
 
 def with_candidates(
-    slots: Slots, candidates: Located, association: Association, detection: Number, clutter: Number
+    slots: Slots,
+    candidates: Candidates,
+    association: Association,
+    detection: Number,
+    clutter: Number,
 ) -> Slots:
     """Updates the slots that candidates are of, and fills free ones with new objects.
 
@@ -297,7 +287,7 @@ def _where(is_new: Bool[Array, " S"], new: T, old: T) -> T:
 
 
 def _compared(
-    some: Slots | Located, others: Slots | Located, radius: Number
+    some: Slots | Candidates, others: Slots | Candidates, radius: Number
 ) -> tuple[jax.Array, ...]:
     """`[A, B]` for all pairs.
 
@@ -323,7 +313,7 @@ def _gauge(apart: Float[Array, "*A 2"], total: Float[Array, "*A 2 2"]) -> tuple[
     return squared, jnp.log(determinant), inverse
 
 
-def _fused(slots: Slots, others: Slots | Located) -> tuple[Slots, Float[Array, " S"]]:
+def _fused(slots: Slots, others: Slots | Candidates) -> tuple[Slots, Float[Array, " S"]]:
     """Kalman update of each slot by one of the others, in Joseph's form.
 
     Outside of the gate, the covariance of the others grows until they are at about its edge.

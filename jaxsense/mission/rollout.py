@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,9 @@ from jaxsense.models import Models
 from jaxsense.sim import amiro, localisation
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.arena import Arena, Layout
+
+States = TypeVar("States", bound=Any)
+"""Of missions: what `MissionState` holds of physics, under the same names."""
 
 _MESSAGE_PERIODS = 10  # of control, after which a robot repeats its message
 
@@ -178,7 +182,7 @@ class _Motion:
 
 
 @jax.named_scope("mission.move")
-def move(mission: Mission, states: MissionState, wanted: Float[Array, "B R 2"]) -> MissionState:
+def move(mission: Mission, states: States, wanted: Float[Array, "B R 2"]) -> States:
     """Simulates one control period of B missions side by side.
 
     Contacts cost several times as much as everything else, and the planner avoids them. All robots

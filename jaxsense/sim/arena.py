@@ -28,7 +28,7 @@ _STORE = -2.0  # m, height of hidden shapes, below the floor
 _AWAY = -1000.0  # m, x of absent PoIs and walls
 _APART = 10.0  # m, between absent PoIs, so that a look at one shows no other
 _SHORTEST, _LONGEST = 0.25, 0.55  # shares of the arena's side that inner walls are long
-_PASSAGE = 0.4  # m, smallest gap between an inner wall and other walls
+_PASSAGE = 0.6  # m, smallest gap between an inner wall and other walls
 _NUM_CANDIDATES = 64  # places drawn for each inner wall
 
 
@@ -183,7 +183,7 @@ def random_layout(key: Key, config: ArenaConfig, classes: Int[Array, "N"]) -> La
 
     The arena is divided into square cells, about twice as many as PoIs. Each PoI gets a cell of its
     own and a position that leaves half the gap free on every side. Where their number varies, the
-    last ones may be absent. Inner walls keep `poi_gap` from PoIs and 0.4 m from all walls, so that
+    last ones may be absent. Inner walls keep `poi_gap` from PoIs and 0.6 m from all walls, so that
     they close nothing in.
 
     Args:

@@ -74,7 +74,7 @@ def test_a_robot_boxed_in_reaches_only_its_box_and_leaves_a_margin():
     angles, grid = np.arange(8) * np.pi / 4, two_rooms()
     ring = np.stack([np.cos(angles) - 1.5, np.sin(angles), np.full(8, 0.35)], axis=-1)
     boxed = distances(grid, POSE[:2], ring)
-    to_ring = np.min([grid.offsets(centre)[2] for centre in ring[:, :2]], axis=0)
+    to_ring = np.min([grid.offsets(centre)[2] for centre in jnp.array(ring[:, :2])], axis=0)
     is_inside = (to_ring >= 0.45) & (grid.offsets(POSE[:2])[2] < 1)
     np.testing.assert_array_equal(jnp.isfinite(boxed), is_inside)
     # .3 m from the centre of a circle that keeps .45 m, and .7 m from the goal's cell.

@@ -1,0 +1,72 @@
+"""What missions in unknown places find, and how long they take, by policy.
+
+    python -m benchmarks.exploration --arenas 1024
+
+Arenas of 8 m with 4 to 12 PoIs and five inner walls; the models of preset `default` that ship.
+"""
+
+import argparse
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsense import exploration, load_pretrained, mission
+from jaxsense.config.mission import CONTROL_PERIOD
+
+SECONDS = 600.0
+
+
+def main() -> None:
+    """Prints a row for each policy, and for known places."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--arenas", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--robots", nargs="+", default=["camera", "lidar"])
+    args = parser.parse_args()
+    config, models = load_pretrained("default")
+    change = dataclasses.replace
+    arena = change(config.arena, side=8.0, num_pois=12, fewest_pois=4, inner_walls=5)
+    limit = change(config.mission, time_limit=SECONDS)
+    config = change(config, arena=arena, mission=limit, robots=tuple(args.robots))
+    made, steps = mission.make_mission(config), round(SECONDS / CONTROL_PERIOD)
+    keys = jax.random.split(jax.random.key(args.seed), args.arenas)
+
+    def play(policy: exploration.Policy, is_told: bool):
+        states = jax.vmap(lambda key: exploration.reset(key, made, models))(keys)
+        if is_told:
+            states = jax.vmap(lambda state: exploration.told(made, state))(states)
+        states = exploration.rollout_batch(keys, made, models, policy, states, steps)
+        return jax.vmap(lambda state: exploration.measure(models, state))(states)
+
+    played = jax.jit(play, static_argnums=(0, 1))
+    known = np.asarray(played(exploration.POLICIES["nearest"], True)["time_s"])
+    print(f"known places: {known.mean():.1f} s", flush=True)
+    for name, policy in exploration.POLICIES.items():
+        print(name, row(jax.tree.map(np.asarray, played(policy, False)), known), flush=True)
+
+
+def row(found: dict[str, Any], known: np.ndarray) -> str:
+    """The figures of a policy, next to the seconds with known places."""
+    present, shown, seconds = found["present"].sum(), found["found"].sum(), found["time_s"]
+    error = found["gospa"].position_error
+    figures = {
+        "seconds": seconds.mean(),
+        "over known": seconds.mean() / known.mean(),
+        "found": shown / present,
+        "false": found["false"].sum() / present,
+        "duplicates": found["gospa"].duplicates.sum() / present,
+        "metres off": error.mean(),
+        "right": found["right"].sum() / shown,
+        "confidence": found["confidence"].sum() / shown,
+        "looks a PoI": found["looks"].sum() / present,
+        "late": np.mean(seconds >= SECONDS),
+        "with contact": np.mean(found["collisions"] > 0),
+        "overflows": found["overflow"].sum(),
+    }
+    return ", ".join(f"{name} {number:.4g}" for name, number in figures.items())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,50 @@
+"""What a mission in an unknown place has found."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from jaxsense.exploration import slots as objects
+from jaxsense.exploration.state import ExplorationState
+from jaxsense.models import Models
+
+CUTOFF = 0.3
+"""Distance at which an object on the map is none of the true ones, in metres."""
+
+
+def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]:
+    """Computes the metrics of one mission.
+
+    Returns:
+      `gospa`: see `slots.Gospa`, with p = 1.
+      `present`: number of PoIs.
+      `found`: number of PoIs that the map shows within `CUTOFF`.
+      `false`: number of objects on the map that are none.
+      `right`: number of PoIs found whose most likely class is the true one.
+      `confidence`: sum of the probabilities of these classes.
+      `overflow`: candidates that found no free slot.
+      `time_s`: duration, in seconds.
+      `looks`: number of all robots.
+      `collisions`: control periods with contact.
+    """
+    slots, layout, is_found = state.slots, state.scene.layout, objects.found(state.slots)
+    result = objects.gospa(slots.position, is_found, layout.position, layout.present, CUTOFF)
+    apart = jnp.linalg.norm(layout.position[:, None] - slots.position[None], axis=-1)
+    apart = jnp.where(is_found[None], apart, jnp.inf)
+    is_there = layout.present & (jnp.min(apart, axis=1) < CUTOFF)
+    probabilities = jax.vmap(models.fusion.class_probabilities)(slots.belief)
+    shown = probabilities[jnp.argmin(apart, axis=1)]
+    is_right = is_there & (jnp.argmax(shown, axis=1) == state.classes)
+    price = CUTOFF / 2
+    return {
+        "gospa": result,
+        "present": jnp.sum(layout.present),
+        "found": jnp.sum(layout.present) - jnp.round(result.missed / price),
+        "false": jnp.round(result.false / price),
+        "right": jnp.sum(is_right),
+        "confidence": jnp.sum(jnp.where(is_there, jnp.max(shown, axis=1), 0.0)),
+        "overflow": slots.overflow,
+        "time_s": state.time,
+        "looks": jnp.sum(state.robots.looks),
+        "collisions": state.contacts,
+    }
