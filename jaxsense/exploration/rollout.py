@@ -33,6 +33,7 @@ _DECIDING_PERIODS = 20  # of control, after which a robot chooses anew
 _NUM_CANDIDATES = 8
 _REACH = 2.0  # m, within which scans show PoIs
 _DETECTION, _CLUTTER = 0.9, 0.01  # of an object in view; false ones per scan and square metre
+_SHOWN = 0.98  # probability that a look at an object shows it
 _FACING = 20.0  # degrees, largest bearing of a look
 _AT_GOAL = 0.1  # m
 _TURNED = np.radians(10.0)  # rad, from the heading at a frontier
@@ -201,14 +202,11 @@ def _sense(
     in_range = candidates.distance <= config.viewpoint.max_distance
     in_range &= candidates.distance >= config.viewpoint.min_distance
     in_range &= jnp.abs(candidates.bearing) <= jnp.radians(_FACING)
-    is_inside = (
-        jnp.max(jnp.abs(candidates.position), axis=-1)
-        < config.arena.side / 2 - config.arena.poi_radius
-    )
+    reach, radius = config.arena.side / 2, config.arena.poi_radius
+    is_inside = jnp.max(jnp.abs(candidates.position), axis=-1) < reach - radius
     is_valid = candidates.is_valid & is_inside & (is_there | ~in_range)
     candidates = dataclasses.replace(candidates, is_valid=is_valid)
     slots = state.slots
-    radius = config.arena.poi_radius
     found = objects.associate(slots, candidates, radius)
     expected = _expected(mission, state, sensor, pose) & ~found.is_seen
     slots = objects.with_candidates(slots, candidates, found, _DETECTION, _CLUTTER)
@@ -298,6 +296,8 @@ def _look(
         times_seen=slots.times_seen.at[target, modality].add(detects),
         looked_from=slots.looked_from.at[target, modality, at].set(place),
     )
+    is_missed = faces & ~detection.is_there & (jnp.arange(number) == target)
+    after = objects.with_misses(models, after, is_missed, _SHOWN)
     failed = state.failures[target, modality] + 1
     failures = jnp.where(detects, 0, failed) * faces + state.failures[target, modality] * ~faces
     failures = state.failures.at[target, modality].set(failures)

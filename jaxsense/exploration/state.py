@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsense.config import ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, pytree
@@ -97,8 +98,15 @@ class ExplorationState:
 
 @checks.typed
 def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
-    """Starts a mission in a random arena, of which the robots know the outer walls alone."""
+    """Starts a mission in a random arena, of which the robots know the outer walls alone.
+
+    Raises:
+      ConfigError: if no robot can measure distances.
+    """
     config, num_robots = mission.config, len(mission.config.carried)
+    if not any(mission.world.sensors[m].measures_distance for m in config.modality_of_robot):
+        expected = "must include one whose sensor measures distances: it shows floor and walls"
+        raise ConfigError("robots", config.carried, expected)
     class_key, layout_key, light_key, pose_key = jax.random.split(key, 4)
     num_pois = config.arena.num_pois
     classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))

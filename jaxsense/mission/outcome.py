@@ -13,6 +13,7 @@ from jaxsense.config.scene import require_words
 from jaxsense.core import checks
 from jaxsense.dqn import rewards
 from jaxsense.dqn.policies import POLICIES, Values, table
+from jaxsense.mission.roadmap import require_known_places
 from jaxsense.mission.state import ENDED, FAILED, Faults, Mission, MissionState, no_faults
 from jaxsense.models import Models
 from jaxsense.sim import sensors
@@ -50,6 +51,7 @@ class Case:
 def require_playable(config: Config, policies: Mapping[str, Values] | None = None) -> None:
     """Checks that missions can be made and their policies exist, before anything is trained."""
     sensors.make(config)
+    require_known_places(config)
     known = table(policies)
     _require_names(known)
     if not set(config.mission.policies) <= set(known):

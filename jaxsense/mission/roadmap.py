@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsense.config import Config
+from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import MARGIN, NODES_PER_POI, PLANNING_RADIUS, VIEW_SIDES
 from jaxsense.core import checks
 from jaxsense.core.types import Index, product, pytree
@@ -152,9 +152,18 @@ class Roadmap:
         return length[: len(goals)], length[len(goals) :]
 
 
+def require_known_places(config: Config) -> None:
+    """Raises `ConfigError` if robots have to find their way, or how many PoIs there are."""
+    for name in ("inner_walls", "fewest_pois"):
+        if (number := getattr(config.arena, name)) > 0:
+            reason = "must be 0 where places are known; otherwise see jaxsense.exploration"
+            raise ConfigError(f"arena.{name}", number, reason)
+
+
 @checks.typed
 def build(config: Config, layout: Layout) -> Roadmap:
     """Computes the viewpoints of a layout and the paths to them."""
+    require_known_places(config)
     checks.require_shape("layout.position", layout.position, (config.arena.num_pois, 2))
     arena, centres = config.arena, layout.position
     radius = arena.poi_extent + PLANNING_RADIUS + _MARGIN

@@ -12,20 +12,11 @@ from scipy.optimize import linear_sum_assignment
 from untrained import blank
 
 from jaxsense import Config
-from jaxsense.core.types import pytree
+from jaxsense.exploration import Candidates
 from jaxsense.exploration import slots as maps
 
 MODELS = blank(Config())
 RADIUS, DETECTION, CLUTTER = 0.1, 0.9, 0.005
-
-
-@pytree
-class Candidates:
-    bearing: jax.Array
-    distance: jax.Array
-    position: jax.Array
-    covariance: jax.Array
-    is_valid: jax.Array
 
 
 def at(*places, std=0.03):

@@ -1,0 +1,156 @@
+"""Missions in unknown places: what robots may do, what they find, and what they may know."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsense import ConfigError, exploration, load_pretrained, mission
+from jaxsense.exploration import decide, rollout, slots
+from jaxsense.mission.roadmap import require_known_places
+
+CONFIG, MODELS = load_pretrained("default")
+
+
+def among_walls(config, **changes):
+    given = {"side": 5.0, "num_pois": 5, "fewest_pois": 3, "inner_walls": 2, **changes}
+    return dataclasses.replace(config, arena=dataclasses.replace(config.arena, **given))
+
+
+HIDDEN = among_walls(CONFIG)
+MISSION = mission.make_mission(HIDDEN)
+NOTHING = HIDDEN.arena.num_pois + 4 + 12
+
+
+@pytest.fixture(scope="module")
+def begun():
+    return jax.jit(exploration.reset, static_argnums=1)(jax.random.key(3), MISSION, MODELS)
+
+
+@pytest.fixture(scope="module")
+def told(begun):
+    return exploration.told(MISSION, begun)
+
+
+def test_robots_start_apart_from_everything_on_an_empty_map(begun):
+    layout, poses = begun.scene.layout, begun.scene.poses
+    apart = jnp.linalg.norm(poses[:, None, :2] - layout.position[None], axis=-1)
+    assert jnp.min(apart) > 0.35 + HIDDEN.arena.poi_radius
+    assert jnp.linalg.norm(poses[0, :2] - poses[1, :2]) > 0.35
+    assert not jnp.any(begun.slots.is_used)
+    assert not jnp.any(begun.grid.evidence)
+
+
+def test_who_is_told_everything_knows_walls_and_pois_as_they_are(begun, told):
+    layout, known = begun.scene.layout, slots.found(told.slots)
+    np.testing.assert_array_equal(known[: len(layout.present)], layout.present)
+    assert jnp.sum(known) == jnp.sum(layout.present)
+    places = told.slots.position[: len(layout.present)]
+    np.testing.assert_array_equal(places[layout.present], layout.position[layout.present])
+    # The middle of each wall is occupied, a place half a metre beside it is not.
+    for x, y, yaw, half in np.asarray(layout.walls):
+        beside = jnp.array([x - 0.4 * np.sin(yaw), y + 0.4 * np.cos(yaw)])
+        assert half > 0
+        assert told.grid.at(told.grid.occupied, jnp.array([x, y]))
+        assert not told.grid.at(told.grid.occupied, beside)
+
+
+def options(state):
+    return jax.jit(decide.options_of, static_argnums=0)(MISSION, MODELS, state, 0)
+
+
+def test_a_robot_that_knows_all_may_look_at_each_poi_and_explores_nothing(told):
+    found, number = options(told), len(told.slots.existence)
+    present = jnp.pad(told.scene.layout.present, (0, 4))
+    np.testing.assert_array_equal(found.is_possible[:number], present)
+    assert not jnp.any(found.is_possible[number:])
+    for slot in np.flatnonzero(present):
+        to_poi = told.slots.position[slot] - found.goal[slot, :2]
+        distance = float(jnp.linalg.norm(to_poi))
+        assert HIDDEN.viewpoint.min_distance <= distance <= HIDDEN.navigation.view_range + 1e-5
+        assert jnp.arctan2(to_poi[1], to_poi[0]) == pytest.approx(float(found.goal[slot, 2]))
+        # As fast as a robot drives, no path is shorter than the straight line.
+        straight = jnp.linalg.norm(found.goal[slot, :2] - told.scene.poses[0, :2])
+        assert found.seconds[slot] >= 5 * straight
+    # Both robots carry other sensors, so neither takes anything away from the other.
+    assert not jnp.any(found.is_taken)
+
+
+def test_looks_that_failed_or_tell_nothing_are_not_worth_going_for(told):
+    slot = int(jnp.argmax(told.scene.layout.present))
+    failed = dataclasses.replace(told, failures=told.failures.at[slot].set(3))
+    assert options(told).gain[slot] > 0
+    assert options(failed).gain[slot] == 0
+    classes = MODELS.fusion.classes
+    belief = jax.tree.map(lambda rows, x: rows.at[slot].set(x[0]), told.slots.belief, classes)
+    seen = told.slots.times_seen.at[slot].set(1)
+    certain = dataclasses.replace(told.slots, belief=belief, times_seen=seen)
+    assert options(dataclasses.replace(told, slots=certain)).gain[slot] <= 0
+
+
+def test_rules_choose_by_hand_worked_numbers():
+    # A look worth .5 nats 9 s away, a frontier of 1 m2 4 s away, another of 8 m2 19 s away.
+    chosen = exploration.Options(
+        gain=jnp.array([0.5, 1.0, 8.0, 9.0]),
+        seconds=jnp.array([9.0, 4.0, 19.0, 1.0]),
+        goal=jnp.zeros((4, 3)),
+        is_possible=jnp.array([True, True, True, False]),
+        is_taken=jnp.zeros(4, bool),
+        is_look=jnp.array([True, False, False, False]),
+    )
+    key, taken = jax.random.key(0), dataclasses.replace(chosen, is_taken=jnp.arange(4) == 1)
+    best = {n: int(jnp.argmax(f(key, MODELS, chosen))) for n, f in exploration.POLICIES.items()}
+    # A second: 2 / 9, 1 / 4 and 8 / 19.
+    assert best == {"explore_first": 1, "look_first": 0, "nearest": 1, "gain_rate": 2}
+    assert jnp.argmax(exploration.POLICIES["nearest"](key, MODELS, taken)) == 0
+    nothing = dataclasses.replace(chosen, is_possible=jnp.zeros(4, bool))
+    for policy in exploration.POLICIES.values():
+        assert jnp.argmax(policy(key, MODELS, nothing)) == 4
+
+
+def test_one_scan_shows_floor_and_the_pois_in_view(begun):
+    after = jax.jit(rollout.sense, static_argnums=1)(jax.random.key(1), MISSION, MODELS, begun)
+    assert jnp.sum(after.grid.free) > 100
+    used = np.flatnonzero(after.slots.is_used)
+    places = np.asarray(begun.scene.layout.position)
+    for slot in used:
+        apart = np.linalg.norm(places - np.asarray(after.slots.position[slot]), axis=-1)
+        assert apart.min() < 4 * np.sqrt(np.trace(after.slots.covariance[slot]))
+    # What is free is no wall.
+    walls = exploration.told(MISSION, begun).grid.occupied
+    assert jnp.sum(after.grid.free & walls) <= 0.01 * jnp.sum(walls)
+
+
+def test_places_are_either_known_or_found(begun):
+    with pytest.raises(ConfigError, match=r"arena.inner_walls = 2: must be 0 where places"):
+        require_known_places(HIDDEN)
+    with pytest.raises(ConfigError, match=r"arena.fewest_pois = 3"):
+        mission.reset(
+            jax.random.key(0), mission.make_mission(among_walls(CONFIG, inner_walls=0)), MODELS
+        )
+    blind = mission.make_mission(dataclasses.replace(HIDDEN, robots=("camera", "camera")))
+    with pytest.raises(ConfigError, match="must include one whose sensor measures distances"):
+        exploration.reset(jax.random.key(0), blind, MODELS)
+
+
+@pytest.mark.slow
+def test_robots_find_all_pois_and_what_they_are():
+    keys = jax.random.split(jax.random.key(21), (2, 8))
+
+    @jax.jit
+    def play(keys):
+        states = jax.vmap(lambda key: exploration.reset(key, MISSION, MODELS))(keys[0])
+        policy = exploration.POLICIES["nearest"]
+        states = exploration.rollout_batch(keys[1], MISSION, MODELS, policy, states, 2400)
+        return states, jax.vmap(lambda state: exploration.measure(MODELS, state))(states)
+
+    states, found = jax.tree.map(np.asarray, play(keys))
+    present = found["present"].sum()
+    assert found["found"].sum() >= present - 1
+    assert found["false"].sum() <= 2
+    assert found["right"].sum() >= present - 2
+    assert found["gospa"].position_error.max() < 0.05
+    assert found["collisions"].sum() == 0
+    assert states.done.mean() >= 0.75
