@@ -6,7 +6,6 @@ Arenas of 8 m with 4 to 12 PoIs and five inner walls; the models of preset `defa
 """
 
 import argparse
-import dataclasses
 from typing import Any
 
 import jax
@@ -14,20 +13,19 @@ import numpy as np
 
 from jaxsense import exploration, load_pretrained, mission
 from jaxsense.config.mission import CONTROL_PERIOD
+from jaxsense.config.options import from_plain
 
 SECONDS = 600.0
 
 
 def main() -> None:
-    """Prints a row for each policy, and for known places."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Prints a row for each policy."""
+    parser = argparse.ArgumentParser("python -m benchmarks.exploration")
     parser.add_argument("--arenas", type=int, default=64)
     arenas = parser.parse_args().arenas
     config, models = load_pretrained("default")
-    change = dataclasses.replace
-    arena = change(config.arena, side=8.0, num_pois=12, fewest_pois=4, inner_walls=5)
-    limit = change(config.mission, time_limit=SECONDS)
-    config = change(config, arena=arena, mission=limit)
+    arena = {"side": 8.0, "num_pois": 12, "fewest_pois": 4, "inner_walls": 5}
+    config = from_plain({"arena": arena, "mission": {"time_limit": SECONDS}}, config)
     made, steps = mission.make_mission(config), round(SECONDS / CONTROL_PERIOD)
     keys = jax.random.split(jax.random.key(7), (2, arenas))
 
@@ -40,7 +38,6 @@ def main() -> None:
 
     played = jax.jit(play, static_argnums=(0, 1))
     known = np.asarray(played(exploration.POLICIES["nearest"], True)["time_s"])
-    print(f"known places: {known.mean():.1f} s", flush=True)
     for name, policy in exploration.POLICIES.items():
         print(name, row(jax.tree.map(np.asarray, played(policy, False)), known), flush=True)
 
@@ -48,11 +45,10 @@ def main() -> None:
 def row(found: dict[str, Any], known: np.ndarray) -> str:
     """The figures of a policy, most of them for each PoI, next to the seconds with known places."""
     present, seconds = found["present"].sum(), found["time_s"]
-    named = "found", "false", "right", "confidence", "looks", "overflow"
     figures = {
         "seconds": seconds.mean(),
         "over known": seconds.mean() / known.mean(),
-        **{name: found[name].sum() / present for name in named},
+        **{n: found[n].sum() / present for n in ("found", "false", "right", "confidence", "looks")},
         "duplicates": found["gospa"].duplicates.sum() / present,
         "metres off": found["gospa"].position_error.mean(),
         "late": np.mean(seconds >= SECONDS),

@@ -3,8 +3,8 @@
     python -m benchmarks.fast_model default --policy auction
 
 Missions are simulated in MJX. The MDP starts where they start, and its robots look where those of
-the mission have looked, in the same order. Prints for each number of PoIs the mean of predicted
-over played durations, until the last look, and their correlation.
+the mission have looked, in the same order. Prints the mean of predicted over played durations,
+until the last look, and their correlation.
 """
 
 import argparse
@@ -127,26 +127,24 @@ def compare(
 
 
 def main() -> None:
-    """Compares the MDP with missions, and prints a line for each number of PoIs."""
+    """Compares the MDP with missions, and prints a line."""
     parser = argparse.ArgumentParser("python -m benchmarks.fast_model")
     parser.add_argument("preset")
     parser.add_argument("--policy", default="latent")
-    parser.add_argument("--pois", type=int, nargs="*", default=[])
+    parser.add_argument("--pois", type=int)
     parser.add_argument("--robots", nargs="*", default=[])
     parser.add_argument("--side", type=float)
     parser.add_argument("--episodes", type=int, default=256)
     parser.add_argument("--seed", type=int, default=7)
     args = parser.parse_args()
     config, models = load_pretrained(args.preset)
-    config = dataclasses.replace(config, robots=tuple(args.robots) or config.robots)
-    for number in args.pois or [config.arena.num_pois]:
-        side = args.side or config.arena.side
-        arena = dataclasses.replace(config.arena, num_pois=number, side=side)
-        there = dataclasses.replace(config, arena=arena)
-        given = jax.random.key(args.seed), there, models, args.policy, args.episodes
-        of_mdp, of_missions = compare(*given)
-        ratio, correlation = of_mdp.mean() / of_missions.mean(), np.corrcoef(of_mdp, of_missions)
-        print(f"{number} PoIs: predicted / played {ratio:.3f}, correlation {correlation[0, 1]:.3f}")
+    number, side = args.pois or config.arena.num_pois, args.side or config.arena.side
+    arena = dataclasses.replace(config.arena, num_pois=number, side=side)
+    robots = tuple(args.robots) or config.robots
+    config, key = dataclasses.replace(config, robots=robots, arena=arena), jax.random.key(args.seed)
+    of_mdp, of_missions = compare(key, config, models, args.policy, args.episodes)
+    ratio, correlation = of_mdp.mean() / of_missions.mean(), np.corrcoef(of_mdp, of_missions)
+    print(f"{number} PoIs: predicted / played {ratio:.3f}, correlation {correlation[0, 1]:.3f}")
 
 
 if __name__ == "__main__":
