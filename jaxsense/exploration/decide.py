@@ -24,7 +24,7 @@ _VIEW_SHARES = (0.6, 0.9)  # of the longest distance of a look
 _TURN_SECONDS = 1.0  # before a look
 _BESIDE = 1.0  # m, between two robots' goals at one frontier
 _STANDS = 0.02  # m/s, below which a robot does not drive
-_SAME_GOAL = 0.2  # m
+_SAME_GOAL = 0.2  # m, between goals, or places of a look, that count as one
 _SAMPLES = 16  # of a line of sight
 _TAKEN = 60.0  # s, detour that a robot prefers to what another one heads for
 
@@ -111,6 +111,8 @@ def choose(
     goal = options.goal[jnp.minimum(target, nothing - 1)]
     goal = jnp.where(target == nothing, state.scene.poses[robot], goal)
     way = grids.distances(state.grid, goal[:2], blocked(mission, state, robot))
+    length = lengths_at(state.grid, way, state.scene.poses[robot, None, :2])[0]
+    left = jnp.where(jnp.isfinite(length), length, 0.0)
     is_same = jnp.linalg.norm(goal[:2] - state.robots.goal[robot, :2]) < _SAME_GOAL
     return state.with_robot(
         robot,
@@ -118,7 +120,7 @@ def choose(
         goal=goal,
         way=way,
         reconsiders=jnp.bool_(False),
-        left=jnp.where(is_same, state.robots.left[robot], jnp.inf),
+        left=jnp.where(is_same, jnp.maximum(state.robots.left[robot], left), jnp.inf),
         progress_at=jnp.where(is_same, state.robots.progress_at[robot], state.time),
     )
 
@@ -189,17 +191,22 @@ def _views(
     distances = jnp.maximum(config.navigation.view_range * jnp.array(_VIEW_SHARES), near)
     offsets = (distances[:, None, None] * ring[None]).reshape(-1, 2)
 
-    def of_slot(centre: jax.Array, looked_from: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def of_slot(
+        centre: jax.Array, looked_from: jax.Array, failed_from: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         places = jnp.concatenate([centre[None] + offsets, position[None]])
         apart = jnp.linalg.norm(places[:, None] - looked_from[None], axis=-1)
         is_new = models.novelty.to_go(apart, modality) <= 0
+        from_failed = jnp.linalg.norm(places[:, None] - failed_from[None], axis=-1)
+        is_new &= jnp.min(from_failed, axis=1) > _SAME_GOAL
         sees = jax.vmap(lambda place: can_look(mission, state, place, centre))(places)
         length = jnp.append(lengths_at(state.grid, lengths, places[:-1]), 0.0)
         length = jnp.where(is_new & sees, length, jnp.inf)
         nearest = jnp.argmin(length)
         return places[nearest], length[nearest]
 
-    return jax.vmap(of_slot)(slots.position, slots.looked_from[:, modality])
+    looked_from, failed_from = slots.looked_from[:, modality], state.failed_from[:, modality]
+    return jax.vmap(of_slot)(slots.position, looked_from, failed_from)
 
 
 def can_look(

@@ -188,7 +188,9 @@ def with_view(
 
 
 def is_passable(grid: Grid, blocked: Float[Array, "P 3"]) -> Cells:
-    """Free cells in which a robot can stand, the planning radius away from obstacles.
+    """Free cells in which a robot can stand, the planning radius away from bodies and outer walls.
+
+    Next to inner walls some are too near; the controller keeps off.
 
     Args:
       blocked: x, y and radius of other bodies, in metres, from whose outlines it keeps away, too.
@@ -242,11 +244,6 @@ def distances(grid: Grid, start: Place, blocked: Float[Array, "P 3"]) -> Lengths
         return paths, jnp.any(paths < state[0])
 
     return jax.lax.while_loop(lambda state: state[1], around, (begin, is_there))[0]
-
-
-def is_reachable(grid: Grid, distances: Lengths, position: Place) -> Bool[Array, ""]:
-    """Whether a path leads to a position, or to a passable cell next to it."""
-    return _nearest(grid, jnp.isfinite(distances), position)[1]
 
 
 def way(grid: Grid, distances: Lengths, position: Place) -> Place:
@@ -318,11 +315,6 @@ def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> F
         return left, Frontiers(position, heading, size * is_valid, distance, is_valid)
 
     return jax.lax.scan(take, score, length=number)[1]
-
-
-def coverage(grid: Grid, reachable: Cells) -> Float[Array, " M"]:
-    """Share of the reachable floor that each modality has seen."""
-    return jnp.sum(grid.seen & reachable[None], axis=(1, 2)) / jnp.maximum(jnp.sum(reachable), 1)
 
 
 def _crossed(

@@ -24,23 +24,20 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
       `confidence`: sum of the probabilities of these classes.
       `overflow`: candidates that found no free slot.
       `time_s`: duration, in seconds.
-      `looks`: number of all robots.
+      `looks`: number of all robots, with those that show nothing.
       `collisions`: control periods with contact.
     """
     slots, layout, is_found = state.slots, state.scene.layout, objects.found(state.slots)
     result = objects.gospa(slots.position, is_found, layout.position, layout.present, CUTOFF)
-    apart = jnp.linalg.norm(layout.position[:, None] - slots.position[None], axis=-1)
-    apart = jnp.where(is_found[None], apart, jnp.inf)
-    is_there = layout.present & (jnp.min(apart, axis=1) < CUTOFF)
+    is_there = result.slot < len(is_found)
     probabilities = jax.vmap(models.fusion.class_probabilities)(slots.belief)
-    shown = probabilities[jnp.argmin(apart, axis=1)]
+    shown = probabilities.at[result.slot].get(mode="clip")
     is_right = is_there & (jnp.argmax(shown, axis=1) == state.classes)
-    price = CUTOFF / 2
     return {
         "gospa": result,
         "present": jnp.sum(layout.present),
-        "found": jnp.sum(layout.present) - jnp.round(result.missed / price),
-        "false": jnp.round(result.false / price),
+        "found": jnp.sum(is_there),
+        "false": jnp.sum(is_found) - jnp.sum(is_there),
         "right": jnp.sum(is_right),
         "confidence": jnp.sum(jnp.where(is_there, jnp.max(shown, axis=1), 0.0)),
         "overflow": slots.overflow,

@@ -6,7 +6,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
 from jaxsense.config.mission import CONTROL_PERIOD
@@ -16,7 +16,8 @@ from jaxsense.exploration import decide, proposals
 from jaxsense.exploration import grid as grids
 from jaxsense.exploration import slots as objects
 from jaxsense.exploration.decide import Policy
-from jaxsense.exploration.state import ExplorationState
+from jaxsense.exploration.slots import Slots
+from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
 from jaxsense.mission import navigation
 from jaxsense.mission.act import STUCK_TIME, where_due
 from jaxsense.mission.decide import RECOVERY_TIME
@@ -34,6 +35,12 @@ _NUM_CANDIDATES = 8
 _REACH = 2.0  # m, within which scans show PoIs
 _DETECTION, _CLUTTER = 0.9, 0.01  # of an object in view; false ones per scan and square metre
 _SHOWN = 0.98  # probability that a look at an object shows it
+_RGB = 3  # channels of a sensor whose images show PoIs
+_RIM = 10.0  # degrees, at the rim of a scan, where it may cut a PoI
+_NEAR = 0.3  # m, around a robot or object, where floor may stay unknown
+_SAMPLES = 16  # of a line of sight
+_GIVEN_UP = 0.5  # m, around a frontier
+_IDLE_TIME = 2.95  # s without anything to do for all robots, after which a mission ends
 _FACING = 20.0  # degrees, largest bearing of a look
 _AT_GOAL = 0.1  # m
 _TURNED = np.radians(10.0)  # rad, from the heading at a frontier
@@ -52,7 +59,8 @@ def rollout_batch(
     """Runs B missions side by side for some control periods.
 
     Args:
-      keys: `[B]`.
+      keys: `[B]` random keys.
+      policy: of all robots; static, as are `steps`.
     """
 
     def go_on(states: ExplorationState, keys: Key):
@@ -87,13 +95,14 @@ def step(
 
     all_robots = jnp.arange(num_robots)
     for robot in range(num_robots):
-        states = jax.vmap(_progressed, (0, None))(states, robot)
+        states = jax.vmap(functools.partial(_progressed, mission), (0, None))(states, robot)
     states, _ = jax.lax.scan(decided, states, all_robots)
     steer_each = jax.vmap(functools.partial(steer, mission), (None, 0))
     wanted = jax.vmap(steer_each, (0, None))(states, all_robots)
     states = move(mission, states, wanted)
-    nothing = len(before.slots.existence[0]) + decide.NUM_FRONTIERS
-    is_over = jnp.all(states.robots.target == nothing, axis=-1) & (states.steps > 0)
+    is_idle = states.robots.target == before.slots.is_used.shape[1] + NUM_FRONTIERS
+    since = states.time[:, None] - states.robots.progress_at
+    is_over = jnp.all(is_idle & (since > _IDLE_TIME), axis=-1)
     steps = states.steps + 1
     is_late = steps * CONTROL_PERIOD >= mission.config.mission.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_over | is_late)
@@ -104,7 +113,7 @@ def step(
 def steer(mission: Mission, state: ExplorationState, robot: Index) -> Float[Array, "2"]:
     """Speeds that a robot wants: along its way, or turning to the object that it looks at.
 
-    What is within reach of the next two seconds, its proximity sensors show.
+    Its proximity sensors show what is near.
     """
     poses, robots = state.scene.poses, state.robots
     pose = poses[robot]
@@ -130,10 +139,11 @@ def _is_there(state: ExplorationState, robot: Index) -> Bool[Array, ""]:
     return jnp.linalg.norm(way) < _AT_GOAL
 
 
-def _progressed(state: ExplorationState, robot: Index) -> ExplorationState:
+def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> ExplorationState:
     """Notes whether a robot gets nearer to its goal; one that does not backs off, and reconsiders.
 
-    A frontier is done with once the robot has turned to it.
+    It reconsiders, too, once it has turned to a frontier, or if its slot has been cleared. Floor at
+    a frontier that it has still not seen, or not reached, counts as seen: it is given up.
     """
     robots, pose = state.robots, state.scene.poses[robot]
     left = decide.lengths_at(state.grid, robots.way[robot], pose[None, :2])[0]
@@ -141,14 +151,23 @@ def _progressed(state: ExplorationState, robot: Index) -> ExplorationState:
     there = _is_there(state, robot)
     progresses = left < robots.left[robot] - _PROGRESS
     is_stuck = ~there & ~progresses & (state.time - robots.progress_at[robot] > STUCK_TIME)
-    ends = there & (robots.target[robot] >= len(state.slots.existence)) & (off < _TURNED)
+    target, number = robots.target[robot], len(state.slots.is_used)
+    explores = (target >= number) & (target < number + NUM_FRONTIERS)
+    ends = explores & there & (off < _TURNED)
+    is_gone = (target < number) & ~state.slots.is_used[jnp.minimum(target, number - 1)]
     until = jnp.where(is_stuck, state.time + RECOVERY_TIME, robots.backs_off_until[robot])
-    return state.with_robot(
+    modality, floor = mission.modalities[robot], state.grid
+    is_given_up = floor.offsets(robots.goal[robot, :2])[2] < _GIVEN_UP
+    seen = floor.seen[modality] | (is_given_up & explores & (ends | is_stuck))
+    floor = dataclasses.replace(floor, seen=floor.seen.at[modality].set(seen))
+    works = target < number + NUM_FRONTIERS
+    notes = progresses | (there & works) | is_stuck
+    return dataclasses.replace(state, grid=floor).with_robot(
         robot,
-        left=jnp.where(progresses, left, robots.left[robot]),
-        progress_at=jnp.where(progresses | there | is_stuck, state.time, robots.progress_at[robot]),
+        left=jnp.where(is_stuck, jnp.inf, jnp.where(progresses, left, robots.left[robot])),
+        progress_at=jnp.where(notes, state.time, robots.progress_at[robot]),
         backs_off_until=until,
-        reconsiders=robots.reconsiders[robot] | is_stuck | ends,
+        reconsiders=robots.reconsiders[robot] | is_stuck | ends | is_gone,
     )
 
 
@@ -206,23 +225,26 @@ def _sense(
     is_inside = jnp.max(jnp.abs(candidates.position), axis=-1) < reach - radius
     is_valid = candidates.is_valid & is_inside & (is_there | ~in_range)
     candidates = dataclasses.replace(candidates, is_valid=is_valid)
-    slots = state.slots
-    found = objects.associate(slots, candidates, radius)
-    expected = _expected(mission, state, sensor, pose) & ~found.is_seen
-    slots = objects.with_candidates(slots, candidates, found, _DETECTION, _CLUTTER)
-    slots = objects.with_misses(models, slots, expected, _DETECTION)
-    slots = objects.merged(models, slots, radius)
+    found = objects.associate(state.slots, candidates, radius)
+    slots = objects.with_candidates(state.slots, candidates, found, _DETECTION, _CLUTTER)
     floor = state.grid
     if sensor.measures_distance:
-        used = jnp.where(slots.is_used[:, None], slots.position, jnp.inf)
-        ignored = jnp.concatenate([used, beside])
+        most = jnp.where(sensor.blind > 0, sensor.blind, jnp.inf)
+        ignored = jnp.concatenate(
+            [jnp.where(slots.is_used[:, None], slots.position, jnp.inf), beside]
+        )
         floor = grids.with_scan(
-            floor, pose, sensor.angles, readings, config.lidar.max_range, ignored, modality, _REACH
+            floor, pose, sensor.angles, readings, most, ignored, modality, _REACH
         )
     else:
         view = jnp.radians(sensor.field_of_view)
         floor = grids.with_view(floor, pose, view, _REACH, modality)
     state = dataclasses.replace(state, slots=slots, grid=floor)
+    if sensor.measures_distance or sensor.channels == _RGB:
+        looked_at = _looks(state, robot) & (jnp.arange(len(slots.is_used)) == _target(state, robot))
+        missed = _expected(mission, state, sensor, robot) & ~found.is_seen & ~looked_at
+        slots = objects.with_misses(models, slots, missed, _DETECTION)
+        state = dataclasses.replace(state, slots=objects.merged(models, slots, radius))
     return _look(mission, models, state, readings, robot, modality)
 
 
@@ -232,25 +254,52 @@ def outer_walls(side: float) -> Float[Array, "4 4"]:
     return jnp.concatenate([corners, jnp.roll(corners, -1, axis=0)], axis=1)
 
 
+def _in_sight(mission: Mission, state: ExplorationState, robot: int) -> Bool[Array, " S"]:
+    """Slots whose objects nothing hides from a robot: over known floor, behind no nearer body."""
+    pose, positions, arena = state.scene.poses[robot], state.slots.position, mission.config.arena
+    bodies = jnp.where(state.slots.is_used[:, None], positions, jnp.inf)
+    bodies = jnp.concatenate([bodies, others(state.scene.poses[:, :2], robot)])
+    number = len(positions)
+    radius = jnp.where(jnp.arange(len(bodies)) < number, arena.poi_extent, amiro.BODY_RADIUS)
+    way = bodies - pose[None, :2]
+    distance = jnp.maximum(jnp.linalg.norm(way, axis=-1), 1e-3)
+    bearing, half_width = jnp.arctan2(way[:, 1], way[:, 0]), radius / distance
+    apart = jnp.abs(within_a_turn(bearing[:number, None] - bearing[None]))
+    is_beside = apart < half_width[:number, None] + half_width[None]
+    covers = is_beside & (distance[None] < distance[:number, None])
+
+    def is_open(distance: jax.Array, way: jax.Array) -> jax.Array:
+        depths = jnp.linspace(_NEAR, jnp.maximum(distance - _NEAR, _NEAR), _SAMPLES)
+        line = pose[None, :2] + (depths / distance)[:, None] * way[None]
+        return jnp.all(state.grid.at(state.grid.free, line))
+
+    is_open_to = jax.vmap(is_open)(distance[:number], way[:number])
+    return state.slots.is_used & is_open_to & ~jnp.any(covers, axis=1)
+
+
 def _expected(
-    mission: Mission, state: ExplorationState, sensor: scanners.Sensor, pose: Float[Array, "3"]
+    mission: Mission, state: ExplorationState, sensor: scanners.Sensor, robot: int
 ) -> Bool[Array, " S"]:
-    """Slots that a scan shows if they hold an object: in view, in range and not covered."""
-    slots, config = state.slots, mission.config
-    bearing = jax.vmap(viewpoints.bearing, (None, 0))(pose, slots.position)
-    distance = jnp.linalg.norm(slots.position - pose[None, :2], axis=-1)
-    margin = jnp.radians(10.0)
-    in_view = jnp.abs(bearing) < jnp.radians(sensor.field_of_view) / 2 - margin
-    in_view &= (distance > config.viewpoint.min_distance) & (distance < _REACH)
-    share = 1 - config.arena.poi_extent / jnp.maximum(distance, 1e-3)
-    ends = pose[None, :2] + share[:, None] * (slots.position - pose[None, :2])
-    is_clear = jax.vmap(decide.is_clear, (None, None, 0))(state.grid, pose[:2], ends)
-    # Behind another object or robot nothing is expected.
-    apart = jnp.abs(bearing[:, None] - bearing[None])
-    is_nearer = distance[None] < distance[:, None]
-    width = 2 * config.arena.poi_extent / jnp.maximum(distance, 0.1)
-    covers = is_nearer & slots.is_used[None] & (apart < width[None])
-    return slots.is_used & in_view & is_clear & ~jnp.any(covers, axis=1)
+    """Slots that a scan shows if they hold an object: in view, in range and not hidden."""
+    pose, positions = state.scene.poses[robot], state.slots.position
+    bearing = jax.vmap(viewpoints.bearing, (None, 0))(pose, positions)
+    distance = jnp.linalg.norm(positions - pose[None, :2], axis=-1)
+    in_view = jnp.abs(bearing) < jnp.radians(sensor.field_of_view / 2 - _RIM)
+    in_view &= (distance > mission.config.viewpoint.min_distance) & (distance < _REACH)
+    return in_view & _in_sight(mission, state, robot)
+
+
+def _target(state: ExplorationState, robot: int) -> Int[Array, ""]:
+    """The slot that a robot heads for; the last one if it heads for none."""
+    return jnp.minimum(state.robots.target[robot], len(state.slots.is_used) - 1)
+
+
+def _looks(state: ExplorationState, robot: int) -> Bool[Array, ""]:
+    """Whether a robot has arrived at its viewpoint, and turned to its target."""
+    target, pose = _target(state, robot), state.scene.poses[robot]
+    bearing = viewpoints.bearing(pose, state.slots.position[target])
+    is_slot = (state.robots.target[robot] < len(state.slots.is_used)) & state.slots.is_used[target]
+    return is_slot & _is_there(state, robot) & (jnp.abs(bearing) < jnp.radians(_FACING))
 
 
 def _look(
@@ -261,20 +310,16 @@ def _look(
     robot: int,
     modality: int,
 ) -> ExplorationState:
-    """Updates the belief of the robot's target, if it faces it, with what its scan says."""
-    config, slots, robots = mission.config, state.slots, state.robots
-    number = len(slots.existence)
-    target = jnp.minimum(robots.target[robot], number - 1)
+    """Updates the belief of the robot's target, if it looks at it, with what its scan says."""
+    slots, target, looks = state.slots, _target(state, robot), _looks(state, robot)
     pose, centre = state.scene.poses[robot], slots.position[target]
     bearing, distance = viewpoints.bearing(pose, centre), jnp.linalg.norm(centre - pose[:2])
-    faces = (robots.target[robot] < number) & slots.is_used[target] & _is_there(state, robot)
-    faces &= jnp.abs(bearing) < jnp.radians(_FACING)
-    detection = models.detect(
-        modality, mission.world.sensors[modality], readings, bearing, distance
-    )
-    is_confident = jnp.max(detection.features) >= config.mission.least_confidence
-    detects = faces & detection.is_there & is_confident
-    detects &= decide.can_look(mission, state, pose[:2], centre)
+    sensor = mission.world.sensors[modality]
+    detection = models.detect(modality, sensor, readings, bearing, distance)
+    sees = looks & decide.can_look(mission, state, pose[:2], centre)
+    sees &= _in_sight(mission, state, robot)[target]
+    is_confident = jnp.max(detection.features) >= mission.config.mission.least_confidence
+    detects = sees & detection.is_there & is_confident
     apart = jnp.linalg.norm(slots.looked_from[target, modality] - pose[None, :2], axis=-1)
     look = detection.features, modality, models.novelty.weight(apart, modality)
     belief, seen, log_posterior = jax.tree.map(
@@ -287,8 +332,7 @@ def _look(
         new,
     )
     at = slots.times_seen[target, modality] % RECENT_LOOKS
-    # A place from which a look shows nothing is not tried again either.
-    place = jnp.where(faces, pose[:2], slots.looked_from[target, modality, at])
+    place = jnp.where(detects, pose[:2], slots.looked_from[target, modality, at])
     after = dataclasses.replace(
         slots,
         belief=belief,
@@ -296,12 +340,28 @@ def _look(
         times_seen=slots.times_seen.at[target, modality].add(detects),
         looked_from=slots.looked_from.at[target, modality, at].set(place),
     )
-    is_missed = faces & ~detection.is_there & (jnp.arange(number) == target)
-    after = objects.with_misses(models, after, is_missed, _SHOWN)
-    failed = state.failures[target, modality] + 1
-    failures = jnp.where(detects, 0, failed) * faces + state.failures[target, modality] * ~faces
-    failures = state.failures.at[target, modality].set(failures)
-    failures = jnp.where(after.is_used[:, None], failures, 0)
-    return dataclasses.replace(state, slots=after, failures=failures).with_robot(
-        robot, looks=robots.looks[robot] + faces, reconsiders=robots.reconsiders[robot] | faces
+    is_target = jnp.arange(len(slots.is_used)) == target
+    after = objects.with_misses(models, after, is_target & sees & ~detection.is_there, _SHOWN)
+    return _with_failure(state, after, robot, modality, looks & ~detects).with_robot(
+        robot,
+        looks=state.robots.looks[robot] + looks,
+        reconsiders=state.robots.reconsiders[robot] | looks,
+    )
+
+
+def _with_failure(
+    state: ExplorationState, slots: Slots, robot: int, modality: int, fails: Bool[Array, ""]
+) -> ExplorationState:
+    """Notes from where a look at the robot's target failed; cleared slots have no failures."""
+    target = _target(state, robot)
+    number, places = state.failures[target, modality], state.failed_from
+    at = number % places.shape[2]
+    place = jnp.where(fails, state.scene.poses[robot, :2], places[target, modality, at])
+    places = places.at[target, modality, at].set(place)
+    failures = state.failures.at[target, modality].set(number + fails)
+    return dataclasses.replace(
+        state,
+        slots=slots,
+        failures=jnp.where(slots.is_used[:, None], failures, 0),
+        failed_from=jnp.where(slots.is_used[:, None, None, None], places, jnp.inf),
     )

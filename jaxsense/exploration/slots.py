@@ -82,6 +82,7 @@ class Gospa:
       missed: `cutoff^p / 2` for each object without a slot.
       false: `cutoff^p / 2` for each slot without an object.
       duplicates: number of these slots within the cutoff of an object that has one.
+      slot: of each object, S for none.
       position_error: mean distance of the objects found from their slots, in metres; 0 for none.
     """
 
@@ -90,6 +91,7 @@ class Gospa:
     missed: Float[Array, ""]
     false: Float[Array, ""]
     duplicates: Int[Array, ""]
+    slot: Int[Array, " N"]
     position_error: Float[Array, ""]
 
 
@@ -247,7 +249,8 @@ def gospa(
     is_again = jnp.any(may_be & has_slot[None], axis=1) & ~has_object
     error = jnp.sum(jnp.where(is_pair, distance, 0.0)) / jnp.maximum(jnp.sum(is_pair), 1)
     total = (localisation + missed + false) ** (1 / p)
-    return Gospa(total, localisation, missed, false, jnp.sum(is_again), error)
+    slot = jnp.where(has_slot, jnp.argmax(is_pair, axis=0), len(is_found))
+    return Gospa(total, localisation, missed, false, jnp.sum(is_again), slot, error)
 
 
 def auction(profit: Float[Array, "C S"], tolerance: float) -> Int[Array, " C"]:

@@ -15,7 +15,7 @@ from jaxsense.exploration import slots as objects
 from jaxsense.exploration.grid import Grid
 from jaxsense.exploration.slots import Slots
 from jaxsense.mission.navigation import clearance
-from jaxsense.mission.state import Mission
+from jaxsense.mission.state import ATTEMPTS, Mission
 from jaxsense.models import Models
 from jaxsense.sim import amiro
 from jaxsense.sim import arena as arenas
@@ -26,7 +26,8 @@ NUM_FRONTIERS = 12
 """Frontiers that a robot chooses from."""
 SPARE_SLOTS = 4
 """Slots beyond the largest number of PoIs, for false candidates until they are refuted."""
-_CERTAIN = 10.0  # log-odds
+_CERTAIN = 10.0  # log-odds of objects
+_CLEAR = 4  # evidence of cells
 _EXACT = 1e-4  # of a square metre
 _START_ROOM = 0.35  # m, between a robot and everything else at the start
 _NUM_CANDIDATES = 64
@@ -42,13 +43,14 @@ class Explorers:
     """State of the robots, `[R]` each unless another shape is listed.
 
     Attributes:
+      command: forward speed [m/s] and turn rate [rad/s].
       target: the action of the last decision: a slot below S, a frontier below S + F, or S + F for
         nothing to do.
       goal: x [m], y [m] and yaw [rad] in which it drives.
       way: lengths of the shortest paths from each cell to the goal, in metres.
       left: metres to the goal at the last progress, and `progress_at` when that was.
       backs_off_until: seconds from the start.
-      looks: at PoIs.
+      looks: scans that a robot took where it can look at its target.
       reconsiders: must decide, because a look or an obstacle has ended its last decision.
     """
 
@@ -70,7 +72,8 @@ class ExplorationState:
     Attributes:
       grid: floor and walls that robots have seen.
       slots: the map of objects.
-      failures: looks by each modality at each slot in a row that showed nothing.
+      failures: looks by each modality at each slot that told nothing.
+      failed_from: places of the latest of these, in metres; infinite for none.
     """
 
     scene: Scene
@@ -80,6 +83,7 @@ class ExplorationState:
     grid: Grid
     slots: Slots
     failures: Int[Array, "S M"]
+    failed_from: Float[Array, "S M A 2"]
     robots: Explorers
     steps: Int[Array, ""]
     contacts: Int[Array, ""]
@@ -113,7 +117,7 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
     layout = arenas.random_layout(layout_key, config.arena, classes)
     poses = _random_poses(pose_key, mission, layout)
     grid = grids.empty(config.arena.side, len(config.modalities))
-    nothing = num_slots(mission) + NUM_FRONTIERS
+    nothing, size = num_slots(mission) + NUM_FRONTIERS, (num_slots(mission), len(config.modalities))
     return ExplorationState(
         scene=Scene(layout, random_light(light_key, mission.world.reads_conditions), poses),
         classes=classes,
@@ -121,7 +125,8 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
         warmstart=jnp.zeros(3 * num_robots),
         grid=grid,
         slots=objects.empty(models, num_slots(mission)),
-        failures=jnp.zeros((num_slots(mission), len(config.modalities)), jnp.int32),
+        failures=jnp.zeros(size, jnp.int32),
+        failed_from=jnp.full((*size, ATTEMPTS, 2), jnp.inf),
         robots=Explorers(
             command=jnp.zeros((num_robots, 2)),
             target=jnp.full(num_robots, nothing, jnp.int32),
@@ -140,7 +145,7 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
 
 
 def told(mission: Mission, state: ExplorationState) -> ExplorationState:
-    """The same mission for robots that know all walls and places: a bound for every policy."""
+    """The same mission for robots that know all walls and places, to compare with."""
     layout, grid, slots = state.scene.layout, state.grid, state.slots
     x, y = jnp.broadcast_arrays(grid.centres[:, None], grid.centres[None])
     is_wall = jnp.zeros(x.shape, bool)
@@ -156,7 +161,7 @@ def told(mission: Mission, state: ExplorationState) -> ExplorationState:
         position=slots.position.at[:number].set(position),
         covariance=jnp.where(there[:, None, None], _EXACT * slots.covariance, slots.covariance),
     )
-    evidence = jnp.where(is_wall, _CERTAIN, -_CERTAIN).astype(grid.evidence.dtype)
+    evidence = jnp.where(is_wall, _CLEAR, -_CLEAR).astype(grid.evidence.dtype)
     floor = dataclasses.replace(grid, evidence=evidence, seen=jnp.ones_like(grid.seen))
     return dataclasses.replace(state, grid=floor, slots=known)
 

@@ -160,11 +160,8 @@ def _random_poses(
     def room_at(position: jax.Array) -> jax.Array:
         to_pois = jnp.linalg.norm(layout.position - position[None], axis=-1)
         room = jnp.min(to_pois) - config.arena.poi_extent - PLANNING_RADIUS
-        if len(layout.walls):
-            room = jnp.minimum(room, arenas.room_beside(layout.walls, *position) - PLANNING_RADIUS)
         # A corner behind a PoI may have no way out.
-        reached = paths.reaches(position, leads)
-        has_paths = jnp.all(reached | ~layout.present if config.arena.fewest_pois else reached)
+        has_paths = jnp.all(paths.reaches(position, leads))
         return jnp.where(has_paths, room, room - config.arena.side)
 
     def place_robot(taken: jax.Array, robot: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -5,7 +5,6 @@ and that keep clear of walls, PoIs and other robots, a robot takes the one that 
 goal soonest. A command is a forward speed [m/s] and a turn rate [rad/s].
 """
 
-import dataclasses
 from typing import NamedTuple
 
 import chex
@@ -117,7 +116,6 @@ def drive_to(
     waypoint: Float[Array, "2"],
     seconds: float,
     backs_off: Bool[Array, ""],
-    walls: Float[Array, "K 4"] | None = None,
 ) -> Float[Array, "2"]:
     """Command that brings a robot to a waypoint soonest without touching anything.
 
@@ -131,9 +129,7 @@ def drive_to(
     Args:
       waypoint: in metres.
       seconds: how long the robot keeps the command.
-      walls: inner walls that the robot knows of, see `Layout`; by default those of the layout.
     """
-    layout = layout if walls is None else dataclasses.replace(layout, walls=walls)
     chex.assert_shape([waypoint, poses, commands], [(2,), (None, 3), (len(poses), 2)])
     pose, present = poses[robot], commands[robot]
     arcs, cos, sin = _arcs(present[1], seconds), jnp.cos(pose[2]), jnp.sin(pose[2])

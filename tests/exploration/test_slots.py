@@ -149,7 +149,8 @@ def test_gospa_by_brute_force(p):
 def test_gospa_counts_duplicates_apart():
     slots, is_found = jnp.array([[0.1, 0], [0, 0.2], [2, 0], [0, 0]]), jnp.arange(4) < 3
     truth, is_present = jnp.array([[0.0, 0], [1, 0], [2, 0]]), jnp.arange(3) < 2
-    found = vars(maps.gospa(slots, is_found, truth, is_present))
+    found = dict(vars(maps.gospa(slots, is_found, truth, is_present)))
+    np.testing.assert_array_equal(found.pop("slot"), [0, 4, 4])
     # One found at .1 m, one missed, and two false of half the cutoff each.
     expected = {"total": 0.55, "localisation": 0.1, "missed": 0.15, "false": 0.3}
     expected = {**expected, "duplicates": 1, "position_error": 0.1}

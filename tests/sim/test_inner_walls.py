@@ -35,11 +35,11 @@ def test_drawn_walls_keep_their_gaps(layouts):
     np.testing.assert_allclose([half[present].min(), half[present].max()], [1.0, 2.2], atol=0.1)
     sides = np.stack([half, np.full_like(half, 0.025)], axis=-1)
     sides = np.where(yaw[..., None] > 1, sides[..., ::-1], sides)
-    assert 4.0 - (np.abs(centre) + sides).max(axis=-1)[present].max() >= 0.4 - 1e-5
+    assert 4.0 - (np.abs(centre) + sides).max(axis=-1)[present].max() >= 0.6 - 1e-5
     beside = lambda places: np.abs(places[:, :, None] - centre[:, None]) - sides[:, None]  # noqa: E731
     length = lambda gaps: np.linalg.norm(np.maximum(gaps, 0.0), axis=-1)  # noqa: E731
     between = length(beside(centre) - sides[:, :, None])[:, ~np.eye(5, dtype=bool)]
-    assert between.min() >= 0.4 - 1e-5
+    assert between.min() >= 0.6 - 1e-5
     assert length(beside(layouts.position)).min() >= 0.141421 + 0.3 - 1e-5
 
 
