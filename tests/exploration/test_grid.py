@@ -57,8 +57,9 @@ def test_distances_are_dijkstras(seed):
 def test_a_path_leads_through_the_door_in_clear_straight_lines():
     grid, goal, start = two_rooms(), jnp.array([1.5, 2.0]), jnp.array([-1.5, 2.0])
     position, to_goal, driven = start, distances(grid, goal, NOTHING), 0.0
-    # Twice hypot(1.5, 2) = 2.5 m; an 8-connected line is at most 8.3 % longer, and here 12 %.
-    assert 5.0 < to_goal[10, 33] < 5.6
+    # Twice hypot(1.5, 2) = 2.5 m, of which an 8-connected line takes at most 8.3 % more; some 45 cm
+    # of it in the door count four times.
+    assert 5.0 + 3 * 0.3 < to_goal[10, 33] < 5.6 + 3 * 0.45
     while (left := float(jnp.linalg.norm(position - goal))) > 0.11 and driven < 6:
         leg = way(grid, to_goal, position) - position
         assert 0 < jnp.linalg.norm(leg) <= 1.0
