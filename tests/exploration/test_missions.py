@@ -123,6 +123,65 @@ def test_one_scan_shows_floor_and_the_pois_in_view(begun):
     assert jnp.sum(after.grid.free & walls) <= 0.01 * jnp.sum(walls)
 
 
+def stood(state, *poses):
+    """The state with robots at these poses."""
+    scene = dataclasses.replace(state.scene, poses=jnp.array(poses))
+    return dataclasses.replace(state, scene=scene)
+
+
+@pytest.fixture(scope="module")
+def open_floor(told):
+    """Three objects, 1 m, 2 m and .5 m from the origin, on floor that is all known and free."""
+    places = jnp.array([[1.0, 0.0], [2.0, 0.1], [0.0, 0.5]])
+    used = jnp.arange(len(told.slots.is_used)) < 3
+    position = told.slots.position.at[:3].set(places)
+    known = dataclasses.replace(told.slots, is_used=used, position=position)
+    floor = dataclasses.replace(told.grid, evidence=jnp.full_like(told.grid.evidence, -4))
+    return dataclasses.replace(told, slots=known, grid=floor)
+
+
+def test_bodies_and_unknown_floor_hide_objects(open_floor):
+    sight = jax.jit(rollout._in_sight, static_argnums=(0, 2))
+    away, between = (-2.0, -2.0, 0.0), (0.5, 0.0, 0.0)
+    seen = sight(MISSION, stood(open_floor, (0.0, 0.0, 0.0), away), 0)[:3]
+    np.testing.assert_array_equal(seen, [True, False, True])  # the second is behind the first
+    seen = sight(MISSION, stood(open_floor, (0.0, 0.0, 0.0), between), 0)[:3]
+    np.testing.assert_array_equal(seen, [False, False, True])
+    # Floor at x = .6 that nobody has seen.
+    column = int((0.6 + 2.5) / open_floor.grid.cell)
+    evidence = open_floor.grid.evidence.at[column].set(0)
+    unknown = dataclasses.replace(
+        open_floor, grid=dataclasses.replace(open_floor.grid, evidence=evidence)
+    )
+    seen = sight(MISSION, stood(unknown, (0.0, 0.0, 0.0), away), 0)[:3]
+    np.testing.assert_array_equal(seen, [False, False, True])
+
+
+def test_a_robot_that_does_not_get_nearer_backs_off_and_gives_a_frontier_up(open_floor):
+    progressed = jax.jit(rollout._progressed, static_argnums=(0, 2))
+    explores = len(open_floor.slots.is_used)  # the first frontier
+    grid = dataclasses.replace(open_floor.grid, seen=jnp.zeros_like(open_floor.grid.seen))
+    late = dataclasses.replace(open_floor, grid=grid, steps=jnp.int32(60)).with_robot(
+        0,
+        target=explores,
+        goal=jnp.array([1.5, 1.5, 0.0]),
+        left=1.0,
+        progress_at=0.0,
+        reconsiders=False,
+    )
+    at = lambda length: late.with_robot(0, way=jnp.full_like(late.robots.way[0], length))  # noqa: E731
+    nearer, stuck = progressed(MISSION, at(0.9), 0), progressed(MISSION, at(0.97), 0)
+    assert nearer.robots.left[0] == pytest.approx(0.9)
+    assert not nearer.robots.reconsiders[0]
+    assert not jnp.any(nearer.grid.seen)
+    # 6.0 s without 5 cm of progress.
+    assert stuck.robots.reconsiders[0]
+    assert stuck.robots.backs_off_until[0] > 6.5
+    given_up = np.pi * 0.5**2 / grid.cell**2
+    assert jnp.sum(stuck.grid.seen[0]) == pytest.approx(given_up, rel=0.1)
+    assert not jnp.any(stuck.grid.seen[1])
+
+
 def test_places_are_either_known_or_found(begun):
     with pytest.raises(ConfigError, match=r"arena.inner_walls = 2: must be 0 where places"):
         require_known_places(HIDDEN)
