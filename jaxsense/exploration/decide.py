@@ -231,8 +231,4 @@ def lengths_at(
     grid: Grid, lengths: Float[Array, "K K"], places: Float[Array, "V 2"]
 ) -> Float[Array, " V"]:
     """Lengths of paths to places; infinite outside of the arena."""
-    cell = jnp.floor((places + grid.side / 2) / grid.cell).astype(jnp.int32)
-    found = lengths[
-        jnp.clip(cell[:, 0], 0, len(lengths) - 1), jnp.clip(cell[:, 1], 0, len(lengths) - 1)
-    ]
-    return jnp.where(jnp.max(jnp.abs(places), axis=-1) < grid.side / 2, found, jnp.inf)
+    return jnp.take(lengths.ravel(), grid.index(places), mode="fill", fill_value=jnp.inf)
