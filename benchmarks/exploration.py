@@ -6,6 +6,7 @@ Arenas of 8 m with 4 to 12 PoIs and five inner walls; the models of preset `defa
 """
 
 import argparse
+import functools
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from jaxsense import exploration, load_pretrained, mission
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.options import from_plain
 
-SECONDS = 600.0
+SECONDS, CHUNK = 600.0, 100
 
 
 def main() -> None:
@@ -26,20 +27,31 @@ def main() -> None:
     config, models = load_pretrained("default")
     arena = {"side": 8.0, "num_pois": 12, "fewest_pois": 4, "inner_walls": 5}
     config = from_plain({"arena": arena, "mission": {"time_limit": SECONDS}}, config)
-    made, steps = mission.make_mission(config), round(SECONDS / CONTROL_PERIOD)
-    keys = jax.random.split(jax.random.key(7), (2, arenas))
+    made = mission.make_mission(config)
+    reset_key, key = jax.random.split(jax.random.key(7))
 
-    def play(policy: exploration.Policy, is_told: bool):
-        states = jax.vmap(lambda key: exploration.reset(key, made, models))(keys[0])
-        if is_told:
-            states = jax.vmap(lambda state: exploration.told(made, state))(states)
-        states = exploration.rollout_batch(keys[1], made, models, policy, states, steps)
-        return jax.vmap(lambda state: exploration.measure(models, state))(states)
+    @jax.jit
+    def begin() -> exploration.ExplorationState:
+        reset = jax.vmap(lambda key: exploration.reset(key, made, models))
+        return reset(jax.random.split(reset_key, arenas))
 
-    played = jax.jit(play, static_argnums=(0, 1))
-    known = np.asarray(played(exploration.POLICIES["nearest"], True)["time_s"])
+    @functools.partial(jax.jit, static_argnums=0)
+    def go_on(policy: exploration.Policy, chunk: int, states: exploration.ExplorationState):
+        keys = jax.random.split(jax.random.fold_in(key, chunk), arenas)
+        return exploration.rollout_batch(keys, made, models, policy, states, CHUNK)
+
+    def play(policy: exploration.Policy, states: exploration.ExplorationState) -> dict[str, Any]:
+        for chunk in range(round(SECONDS / CONTROL_PERIOD) // CHUNK):
+            states = go_on(policy, chunk, states)
+            if np.all(states.done):
+                break
+        measured = jax.vmap(lambda state: exploration.measure(models, state))(states)
+        return jax.tree.map(np.asarray, measured)
+
+    told = jax.vmap(lambda state: exploration.told(made, state))(begin())
+    known = play(exploration.POLICIES["nearest"], told)["time_s"]
     for name, policy in exploration.POLICIES.items():
-        print(name, row(jax.tree.map(np.asarray, played(policy, False)), known), flush=True)
+        print(name, row(play(policy, begin()), known), flush=True)
 
 
 def row(found: dict[str, Any], known: np.ndarray) -> str:

@@ -129,7 +129,7 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
     """What a robot can do."""
     pose, modality = state.scene.poses[robot], mission.modalities[robot]
     lengths = grids.distances(state.grid, pose[:2], blocked(mission, state, robot))
-    frontiers = grids.frontiers(state.grid, modality, lengths, NUM_FRONTIERS)
+    frontiers = grids.frontiers(state.grid, lengths, NUM_FRONTIERS)
     views, to_view = _views(mission, models, state, robot, lengths)
     slots, robots = state.slots, state.robots
     number = len(slots.existence)
@@ -148,8 +148,8 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
     beside = jnp.linalg.norm(place[:, None] - headed[None, :, :2], axis=-1) < _BESIDE
     is_same = jnp.arange(len(goal))[:, None] == target[None]
     explores = (target >= number) & (target < len(goal))
-    is_taken = jnp.where(is_look[:, None], is_same, beside & explores[None])
     same_sensor = others(mission.modalities, robot) == modality
+    is_taken = jnp.where(is_look[:, None], is_same & same_sensor[None], beside & explores[None])
     length = jnp.append(to_view, frontiers.distance)
     return Options(
         gain=jnp.append(jnp.where(is_open, values, 0.0), frontiers.size),
@@ -157,7 +157,7 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
         + jnp.where(is_look, LOOK_SECONDS + _TURN_SECONDS, _TURN_SECONDS),
         goal=goal,
         is_possible=jnp.append(slots.is_used, frontiers.is_valid) & jnp.isfinite(length),
-        is_taken=jnp.any(is_taken & same_sensor[None], axis=-1),
+        is_taken=jnp.any(is_taken, axis=-1),
         is_look=is_look,
     )
 

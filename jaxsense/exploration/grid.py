@@ -26,7 +26,7 @@ Number = float | Float[Array, ""]
 
 CELL = 0.15
 """Largest side of a cell, in metres."""
-LEAST_FRONTIER = 0.1
+LEAST_FRONTIER = 0.08
 """Unseen floor that makes a frontier, in square metres."""
 _BODY, _UNDER = 0.2, 0.18  # m around robots and PoIs, of beams that end on them and hidden floor
 # Metres behind the end of a beam, so that noise adds no cell in front of a wall, and around the
@@ -41,6 +41,7 @@ _SAMPLES, _BESIDE = 16, 0.08  # of a straight line, and m beside it that are fre
 _SPACING, _VIEW = 1.0, 0.75  # m between frontiers, and of the floor that belongs to one
 _RAYS, _DEPTHS = 128, 32  # of a camera's view
 _AROUND = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+_SIDES = [step for step in _AROUND if 0 in step]
 
 
 @pytree
@@ -188,16 +189,17 @@ def with_view(
 
 
 def is_passable(grid: Grid, blocked: Float[Array, "P 3"]) -> Cells:
-    """Free cells in which a robot can stand, the planning radius away from bodies and outer walls.
+    """Free cells in which a robot can stand: the planning radius away from bodies and outer walls.
 
-    Next to inner walls some are too near; the controller keeps off.
+    Those beside occupied cells are none.
 
     Args:
       blocked: x, y and radius of other bodies, in metres, from whose outlines it keeps away, too.
     """
     to_wall = grid.side / 2 - np.maximum.outer(np.abs(grid.centres), np.abs(grid.centres))
     is_in = _is_in(grid, blocked[:, :2], blocked[:, 2] + PLANNING_RADIUS)
-    return grid.free & (to_wall >= PLANNING_RADIUS) & ~is_in
+    is_open = grid.free & ~_is_beside(grid.occupied, _SIDES)
+    return is_open & (to_wall >= PLANNING_RADIUS) & ~is_in
 
 
 def distances(grid: Grid, start: Place, blocked: Float[Array, "P 3"]) -> Lengths:
@@ -284,23 +286,24 @@ def way(grid: Grid, distances: Lengths, position: Place) -> Place:
     return jnp.where(is_there, ends[last], position)
 
 
-def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> Frontiers:
-    """Places next to floor that a modality has not seen.
+def frontiers(grid: Grid, distances: Lengths, number: int) -> Frontiers:
+    """Places next to floor that no modality has seen, where two by two cells of it have room.
 
     One after the other, the reachable cell in or next to unseen floor with the most of it around,
-    where near floor counts more, and no place before it within 1 m. Places with less than .1 m2
+    where near floor counts more, and no place before it within 1 m. Places with less than .08 m2
     within .75 m are none.
 
     Args:
       distances: of all cells from the robot, in metres, see `distances`.
       number: of places, static.
     """
-    unseen, reachable = ~(grid.seen[modality] | grid.occupied), jnp.isfinite(distances)
+    unseen = _squares(~(jnp.any(grid.seen, axis=0) | grid.occupied))
+    reachable = jnp.isfinite(distances)
     cells, area = np.arange(len(distances)), grid.cell**2
     # Whole numbers, so that equal sums are equal everywhere.
     tent = np.maximum(round(_VIEW / grid.cell) - np.abs(np.subtract.outer(cells, cells)), 0)
     # Where a robot stands it sees at least that cell, or one beside it that it cannot enter.
-    is_place = unseen | _is_beside(unseen & ~reachable, [step for step in _AROUND if 0 in step])
+    is_place = unseen | _is_beside(unseen & ~reachable, _SIDES)
     score = product(product(tent, unseen.astype(jnp.float32)), tent) * (is_place & reachable)
 
     def take(score: jax.Array, _: None) -> tuple[jax.Array, Frontiers]:
@@ -335,6 +338,15 @@ def _is_in(grid: Grid, centres: Float[Array, "P 2"], radii: Float[Array, " P"]) 
     """Cells whose centres are in circles, in metres."""
     x, y = (grid.centres[None] - centres[:, axis, None] for axis in (0, 1))
     return jnp.any(x[:, :, None] ** 2 + y[:, None] ** 2 < radii[:, None, None] ** 2, axis=0)
+
+
+def _squares(cells: Cells) -> Cells:
+    """Cells in squares of two by two: a PoI has no room in fewer."""
+    padded = jnp.pad(cells, 1)
+    rows = padded[1:] & padded[:-1]
+    whole = rows[:, 1:] & rows[:, :-1]
+    beside = whole[1:] | whole[:-1]
+    return beside[:, 1:] | beside[:, :-1]
 
 
 def _is_beside(cells: Cells, steps: list[tuple[int, int]]) -> Cells:

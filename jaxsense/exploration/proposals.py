@@ -73,6 +73,13 @@ def propose(
     return _nearest(pose, none > 0, number, none, none, none, none)
 
 
+def reach(sensor: Sensor, radius: float) -> float:
+    """Metres up to which `propose` shows bodies: five beams, or a tenth of a radian, wide."""
+    if sensor.measures_distance:
+        return 2 * radius / (5 * abs(float(sensor.angles[1] - sensor.angles[0])))
+    return 2 * radius / 0.1
+
+
 def explained_by(
     pose: Float[Array, "3"],
     angles: Float[np.ndarray, " B"],

@@ -32,7 +32,6 @@ SENSING_PERIODS = 5
 """Control periods between two scans of a robot."""
 _DECIDING_PERIODS = 20  # of control, after which a robot chooses anew
 _NUM_CANDIDATES = 8
-_REACH = 2.0  # m, within which scans show PoIs
 _DETECTION, _CLUTTER = 0.9, 0.01  # of an object in view; false ones per scan and square metre
 _SHOWN = 0.98  # probability that a look at an object shows it
 _RGB = 3  # channels of a sensor whose images show PoIs
@@ -142,8 +141,9 @@ def _is_there(state: ExplorationState, robot: Index) -> Bool[Array, ""]:
 def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> ExplorationState:
     """Notes whether a robot gets nearer to its goal; one that does not backs off, and reconsiders.
 
-    It reconsiders, too, once it has turned to a frontier, or if its slot has been cleared. Floor at
-    a frontier that it has still not seen, or not reached, counts as seen: it is given up.
+    It reconsiders, too, once it has turned to a frontier, or if its slot has been cleared. A
+    viewpoint that it has not reached is one of a failed look. Floor at a frontier that it has still
+    not seen, or not reached, counts as seen: it is given up.
     """
     robots, pose = state.robots, state.scene.poses[robot]
     left = decide.lengths_at(state.grid, robots.way[robot], pose[None, :2])[0]
@@ -162,7 +162,10 @@ def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> Expl
     floor = dataclasses.replace(floor, seen=floor.seen.at[modality].set(seen))
     works = target < number + NUM_FRONTIERS
     notes = progresses | (there & works) | is_stuck
-    return dataclasses.replace(state, grid=floor).with_robot(
+    state = dataclasses.replace(state, grid=floor)
+    gives_up, place = is_stuck & (target < number), robots.goal[robot, :2]
+    state = _with_failure(state, state.slots, robot, modality, gives_up, place)
+    return state.with_robot(
         robot,
         left=jnp.where(is_stuck, jnp.inf, jnp.where(progresses, left, robots.left[robot])),
         progress_at=jnp.where(notes, state.time, robots.progress_at[robot]),
@@ -227,22 +230,22 @@ def _sense(
     candidates = dataclasses.replace(candidates, is_valid=is_valid)
     found = objects.associate(state.slots, candidates, radius)
     slots = objects.with_candidates(state.slots, candidates, found, _DETECTION, _CLUTTER)
-    floor = state.grid
+    floor, farthest = state.grid, proposals.reach(sensor, radius)
     if sensor.measures_distance:
         most = jnp.where(sensor.blind > 0, sensor.blind, jnp.inf)
         ignored = jnp.concatenate(
             [jnp.where(slots.is_used[:, None], slots.position, jnp.inf), beside]
         )
         floor = grids.with_scan(
-            floor, pose, sensor.angles, readings, most, ignored, modality, _REACH
+            floor, pose, sensor.angles, readings, most, ignored, modality, farthest
         )
     else:
         view = jnp.radians(sensor.field_of_view)
-        floor = grids.with_view(floor, pose, view, _REACH, modality)
+        floor = grids.with_view(floor, pose, view, farthest, modality)
     state = dataclasses.replace(state, slots=slots, grid=floor)
     if sensor.measures_distance or sensor.channels == _RGB:
         looked_at = _looks(state, robot) & (jnp.arange(len(slots.is_used)) == _target(state, robot))
-        missed = _expected(mission, state, sensor, robot) & ~found.is_seen & ~looked_at
+        missed = _expected(mission, state, sensor, readings, robot) & ~found.is_seen & ~looked_at
         slots = objects.with_misses(models, slots, missed, _DETECTION)
         state = dataclasses.replace(state, slots=objects.merged(models, slots, radius))
     return _look(mission, models, state, readings, robot, modality)
@@ -278,18 +281,34 @@ def _in_sight(mission: Mission, state: ExplorationState, robot: int) -> Bool[Arr
 
 
 def _expected(
-    mission: Mission, state: ExplorationState, sensor: scanners.Sensor, robot: int
+    mission: Mission,
+    state: ExplorationState,
+    sensor: scanners.Sensor,
+    readings: Float[Array, "B *channels"],
+    robot: int,
 ) -> Bool[Array, " S"]:
-    """Slots that a scan shows if they hold an object: in view, in range and not hidden."""
+    """Slots that a scan shows if they hold an object: in view, in range and not hidden.
+
+    If it measures distances, beams must pass through the place: an object that stands before
+    another one, or a wall, may be no candidate.
+    """
+    radius = mission.config.arena.poi_radius
     pose, positions = state.scene.poses[robot], state.slots.position
     bearing = jax.vmap(viewpoints.bearing, (None, 0))(pose, positions)
     distance = jnp.linalg.norm(positions - pose[None, :2], axis=-1)
     in_view = jnp.abs(bearing) < jnp.radians(sensor.field_of_view / 2 - _RIM)
-    in_view &= (distance > mission.config.viewpoint.min_distance) & (distance < _REACH)
+    in_view &= distance > mission.config.viewpoint.min_distance
+    in_view &= distance < proposals.reach(sensor, radius)
+    if sensor.measures_distance:
+        half = jnp.arcsin(jnp.minimum(radius / 2 / jnp.maximum(distance, radius), 1.0))
+        aside = bearing[None] + jnp.array([-1.0, 0.0, 1.0])[:, None] * half[None]
+        beams = (aside - sensor.angles[0]) / (sensor.angles[1] - sensor.angles[0])
+        ends = readings.at[jnp.round(beams).astype(jnp.int32)].get(mode="fill", fill_value=0.0)
+        in_view &= jnp.all(ends > distance[None] + radius, axis=0)
     return in_view & _in_sight(mission, state, robot)
 
 
-def _target(state: ExplorationState, robot: int) -> Int[Array, ""]:
+def _target(state: ExplorationState, robot: Index) -> Int[Array, ""]:
     """The slot that a robot heads for; the last one if it heads for none."""
     return jnp.minimum(state.robots.target[robot], len(state.slots.is_used) - 1)
 
@@ -342,7 +361,8 @@ def _look(
     )
     is_target = jnp.arange(len(slots.is_used)) == target
     after = objects.with_misses(models, after, is_target & sees & ~detection.is_there, _SHOWN)
-    return _with_failure(state, after, robot, modality, looks & ~detects).with_robot(
+    fails = looks & ~detects
+    return _with_failure(state, after, robot, modality, fails, pose[:2]).with_robot(
         robot,
         looks=state.robots.looks[robot] + looks,
         reconsiders=state.robots.reconsiders[robot] | looks,
@@ -350,13 +370,18 @@ def _look(
 
 
 def _with_failure(
-    state: ExplorationState, slots: Slots, robot: int, modality: int, fails: Bool[Array, ""]
+    state: ExplorationState,
+    slots: Slots,
+    robot: Index,
+    modality: Index,
+    fails: Bool[Array, ""],
+    position: Float[Array, "2"],
 ) -> ExplorationState:
     """Notes from where a look at the robot's target failed; cleared slots have no failures."""
     target = _target(state, robot)
     number, places = state.failures[target, modality], state.failed_from
     at = number % places.shape[2]
-    place = jnp.where(fails, state.scene.poses[robot, :2], places[target, modality, at])
+    place = jnp.where(fails, position, places[target, modality, at])
     places = places.at[target, modality, at].set(place)
     failures = state.failures.at[target, modality].set(number + fails)
     return dataclasses.replace(

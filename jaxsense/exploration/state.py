@@ -30,6 +30,7 @@ _CERTAIN = 10.0  # log-odds of objects
 _CLEAR = 4  # evidence of cells
 _EXACT = 1e-4  # of a square metre
 _START_ROOM = 0.35  # m, between a robot and everything else at the start
+_TOGETHER = 1.0  # m in x and y, from the first robot to the others
 _NUM_CANDIDATES = 64
 
 
@@ -167,19 +168,20 @@ def told(mission: Mission, state: ExplorationState) -> ExplorationState:
 
 
 def _random_poses(key: Key, mission: Mission, layout: arenas.Layout) -> Float[Array, "R 3"]:
-    """Draws poses with room around the robots."""
+    """Draws poses of a team that has been put down in one place, with room around the robots."""
     arena, num_robots = mission.config.arena, len(mission.config.carried)
     draws = jax.random.uniform(key, (num_robots, _NUM_CANDIDATES, 3), minval=-1.0)
     reach = arena.side / 2 - amiro.BODY_RADIUS - _START_ROOM
-    places = reach * draws[..., :2]
 
     def stand(taken: jax.Array, robot: jax.Array) -> tuple[jax.Array, jax.Array]:
-        tried = jnp.concatenate([places[robot], jnp.zeros((_NUM_CANDIDATES, 1))], axis=-1)
+        beside = jnp.clip(taken[:1] + _TOGETHER * draws[robot, :, :2], -reach, reach)
+        places = jnp.where(robot == 0, reach * draws[robot, :, :2], beside)
+        tried = jnp.concatenate([places, jnp.zeros((_NUM_CANDIDATES, 1))], axis=-1)
         to_fixed = jax.vmap(lambda pose: clearance(arena, layout, pose[None])[0][0])(tried)
-        apart = jnp.linalg.norm(places[robot][:, None] - taken[None], axis=-1)
+        apart = jnp.linalg.norm(places[:, None] - taken[None], axis=-1)
         room = jnp.minimum(to_fixed, jnp.min(apart, axis=-1) - 2 * amiro.BODY_RADIUS) - _START_ROOM
         chosen = jnp.where(jnp.any(room > 0), jnp.argmax(room > 0), jnp.argmax(room))
-        position = places[robot, chosen]
+        position = places[chosen]
         return taken.at[robot].set(position), jnp.append(position, jnp.pi * draws[robot, 0, 2])
 
     nowhere = jnp.full((num_robots, 2), jnp.inf)

@@ -20,7 +20,7 @@ def scanned(grid, pose, ranges, ignore=NOTHING[:, :2]):
     return grids.with_scan(grid, pose, ANGLES, ranges, 5.0, ignore, 0, reach=2.0)
 
 
-def two_rooms(door=2, seen=False):
+def two_rooms(door=4, seen=False):
     """A wall at x = .075 with a door of some cells at y = 0, all of it known."""
     evidence = jnp.full((40, 40), -1, jnp.int8).at[20].set(1)
     evidence = evidence.at[20, 20 - door // 2 : 20 + door // 2].set(-1)
@@ -39,7 +39,7 @@ def ranges_at(pose, wall=np.inf):
 @pytest.mark.parametrize("seed", range(4))
 def test_distances_are_dijkstras(seed):
     rng, grid = np.random.default_rng(seed), two_rooms()
-    grid = grid.replace(evidence=jnp.where(rng.random((40, 40)) < 0.2, 1, grid.evidence))
+    grid = grid.replace(evidence=jnp.where(rng.random((40, 40)) < 0.05, 1, grid.evidence))
     circles = jnp.array([[1.0, 1.0, 0.5], [-2.0, 2.0, 0.3]])
     passable = np.array(grids.is_passable(grid, circles))
     near = np.any([np.roll(~passable, step, (0, 1)) for step in grids._AROUND], axis=0)
@@ -85,6 +85,14 @@ def test_a_robot_boxed_in_reaches_only_its_box_and_leaves_a_margin():
     assert 0.6 * jnp.abs(x) / jnp.hypot(x, y) > 0.45
 
 
+def test_no_robot_stands_beside_a_wall():
+    passable = np.array(grids.is_passable(two_rooms(), NOTHING))
+    assert not passable[19:22, :17].any()
+    assert passable[[18, 22], 1:39].all()
+    assert passable[20, 19:21].all()
+    assert not passable[20, [18, 21]].any()
+
+
 def test_a_scan_draws_the_wall_and_sees_what_is_before_it():
     grid = scanned(grids.empty(SIDE, 2), POSE, ranges_at(POSE, wall=0.05))
     # The wall ends beams in column 20, 0 to .15 m, but for the gap; all before it is free.
@@ -121,15 +129,15 @@ def test_a_camera_sees_free_floor_in_its_view_up_to_walls():
 
 
 def test_frontiers_lie_at_reachable_unseen_floor():
-    # Unseen: 6 x 6 cells = .81 m2 in either room; and 2 x 2 cells = .09 m2, too small.
-    seen = jnp.ones((2, 40, 40), bool).at[1, 8:10, 8:10].set(False)
-    grid = two_rooms().replace(seen=seen.at[1, np.r_[5:11, 30:36], 30:36].set(False))
+    # Unseen by both: 6 x 6 cells = .81 m2 in either room, and a long strip too narrow for a PoI.
+    seen = jnp.ones((2, 40, 40), bool).at[:, 8, 2:20].set(False).at[1, 12:20].set(False)
+    grid = two_rooms().replace(seen=seen.at[:, np.r_[5:11, 30:36], 30:36].set(False))
     paths = distances(grid, POSE[:2], NOTHING)
-    found = frontiers(grid, 1, paths)
+    found = frontiers(grid, paths)
     np.testing.assert_array_equal(found.is_valid, [True, True, False, False])
     np.testing.assert_allclose(found.size, [0.81, 0.81, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(found.position[:2], [[-1.8, 1.95], [1.95, 1.95]], atol=0.1)
-    closed = frontiers(grid, 1, distances(two_rooms(door=0), POSE[:2], NOTHING))
+    closed = frontiers(grid, distances(two_rooms(door=0), POSE[:2], NOTHING))
     np.testing.assert_array_equal(closed.is_valid, [True, False, False, False])
 
 
@@ -138,7 +146,7 @@ def test_many_missions_equal_a_loop():
         grid = scanned(grids.empty(SIDE, 2), pose, ranges_at(POSE, wall=0.05))
         grid = with_view(grid, pose, 1.4, 2.0, 1)
         paths = distances(grid, pose[:2], NOTHING)
-        return grid, paths, way(grid, paths, jnp.zeros(2)), frontiers(grid, 1, paths)
+        return grid, paths, way(grid, paths, jnp.zeros(2)), frontiers(grid, paths)
 
     poses = POSE[None] + jnp.linspace(0, 0.5, 3)[:, None]
     singles = jax.tree.map(lambda *each: jnp.stack(each), *map(mission, poses))

@@ -38,7 +38,7 @@ def test_robots_start_apart_from_everything_on_an_empty_map(begun):
     layout, poses = begun.scene.layout, begun.scene.poses
     apart = jnp.linalg.norm(poses[:, None, :2] - layout.position[None], axis=-1)
     assert jnp.min(apart) > 0.35 + HIDDEN.arena.poi_radius
-    assert jnp.linalg.norm(poses[0, :2] - poses[1, :2]) > 0.35
+    assert 0.35 < jnp.linalg.norm(poses[0, :2] - poses[1, :2]) < 1.5  # put down together
     assert not jnp.any(begun.slots.is_used)
     assert not jnp.any(begun.grid.evidence)
 
@@ -180,6 +180,31 @@ def test_a_robot_that_does_not_get_nearer_backs_off_and_gives_a_frontier_up(open
     given_up = np.pi * 0.5**2 / grid.cell**2
     assert jnp.sum(stuck.grid.seen[0]) == pytest.approx(given_up, rel=0.1)
     assert not jnp.any(stuck.grid.seen[1])
+
+
+def test_a_viewpoint_out_of_reach_is_one_of_a_failed_look(open_floor):
+    way = jnp.full_like(open_floor.robots.way[0], 1.0)
+    goal = jnp.array([1.0, 0.5, 0.0])
+    late = dataclasses.replace(open_floor, steps=jnp.int32(60)).with_robot(
+        1, target=2, goal=goal, left=1.0, progress_at=0.0, way=way
+    )
+    stuck = jax.jit(rollout._progressed, static_argnums=(0, 2))(MISSION, late, 1)
+    assert stuck.failures[2, 1] == 1
+    assert jnp.sum(stuck.failures) == 1
+    np.testing.assert_array_equal(stuck.failed_from[2, 1, 0], goal[:2])
+    assert not jnp.any(stuck.grid.seen != late.grid.seen)
+
+
+def test_only_beams_that_pass_its_place_refute_an_object(open_floor):
+    expected = jax.jit(rollout._expected, static_argnums=(0, 2, 4))
+    lidar = MISSION.world.sensors[1]
+    state = stood(open_floor, (-2.0, -2.0, 0.0), (0.0, 0.0, 0.0))
+    ahead = np.abs(lidar.angles) < 0.01
+    at_object, passing = (jnp.where(ahead, x, 4.0) for x in (0.9, 4.0))
+    found = expected(MISSION, state, lidar, passing, 1)
+    np.testing.assert_array_equal(found[:3], [True, False, True])  # one is hidden
+    found = expected(MISSION, state, lidar, at_object, 1)
+    np.testing.assert_array_equal(found[:3], [False, False, True])
 
 
 def test_places_are_either_known_or_found(begun):
