@@ -11,6 +11,7 @@ COMMANDS = {
     "tasks": ("jaxsense.task_list", "lists the frozen tasks and the returns of known policies"),
     "train": ("jaxsense.train", "trains the whole pipeline, from scanlines to policies"),
     "evaluate": ("jaxsense.evaluate", "plays missions with the policies of a finished run"),
+    "explore": ("jaxsense.explore", "plays missions in places that the robots do not know"),
     "export": ("jaxsense.export", "writes trained models as one file for robots without JAX"),
 }
 """The module of each command, and what it does."""

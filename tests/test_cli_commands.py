@@ -56,7 +56,7 @@ def test_an_unknown_command_is_refused_in_one_line(monkeypatch, capsys):
     assert stop.value.code == 2
     told = capsys.readouterr()
     assert told.out == ""
-    known = "demo, tasks, train, evaluate, export"
+    known = "demo, tasks, train, evaluate, explore, export"
     assert told.err == f"jaxsense: command = 'trian': must be one of {known}\n"
 
 

@@ -17,10 +17,13 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
 
     Returns:
       `gospa`: see `slots.Gospa`, with p = 1.
+      `off`: `[N]` metres between each PoI and its slot, NaN for one that is not found.
+      `existence`: `[S]` probabilities, NaN in unused slots.
+      `is_object`: `[S]` whether a PoI is within `CUTOFF` of the slot.
       `present`: number of PoIs.
       `found`: number of PoIs that the map shows within `CUTOFF`.
       `false`: number of objects on the map that are none.
-      `right`: number of PoIs found whose most likely class is the true one.
+      `right`: number of PoIs found and looked at whose most likely class is the true one.
       `confidence`: sum of the probabilities of these classes.
       `overflow`: candidates that found no free slot.
       `time_s`: duration, in seconds.
@@ -32,9 +35,16 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
     is_there = result.slot < len(is_found)
     probabilities = jax.vmap(models.fusion.class_probabilities)(slots.belief)
     shown = probabilities.at[result.slot].get(mode="clip")
-    is_right = is_there & (jnp.argmax(shown, axis=1) == state.classes)
+    apart = jnp.linalg.norm(slots.position[:, None] - layout.position[None], axis=-1)
+    off = apart.at[result.slot, jnp.arange(len(is_there))].get(mode="fill", fill_value=jnp.nan)
+    is_near = (apart < CUTOFF) & layout.present[None]
+    is_seen = jnp.any(slots.times_seen > 0, axis=1).at[result.slot].get(mode="clip")
+    is_right = is_there & is_seen & (jnp.argmax(shown, axis=1) == state.classes)
     return {
         "gospa": result,
+        "off": off,
+        "existence": jnp.where(slots.is_used, jax.nn.sigmoid(slots.existence), jnp.nan),
+        "is_object": jnp.any(is_near, axis=1),
         "present": jnp.sum(layout.present),
         "found": jnp.sum(is_there),
         "false": jnp.sum(is_found) - jnp.sum(is_there),

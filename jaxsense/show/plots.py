@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxsense.config import Config
-from jaxsense.core.types import Belief, Reliability
+from jaxsense.core.types import Belief, Fusion, Reliability
+from jaxsense.exploration import ExplorationState
 from jaxsense.show.colours import (
     MARKERS,
     SOFT,
@@ -44,6 +45,7 @@ _MOST = 20  # ellipses of a class
 _CLASS_ROW = 0.24  # inches, of a class in the plot of sigma
 _LOOK_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
+_LIKELY = 0.9  # probability of a class that has a colour on the map
 _MIN_LOOKS = 20  # in a bin of the calibration
 _REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
 _BESIDE = {"loc": "upper left", "bbox_to_anchor": (1, 1), "frameon": False, "fontsize": 9}
@@ -284,3 +286,44 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
         case {"mean": float(middle), "low": float(low), "high": float(high)}:
             return [[max(0.0, middle - low)], [max(0.0, high - middle)]]
     return None
+
+
+def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState]) -> Figure:
+    """One mission in an unknown place, at four times: what robots know, before what is there.
+
+    Grey is unknown, white is free, black is a wall; floor that no sensor has seen is hatched.
+    Ellipses are 2 sigma of the objects on the map, coloured once a class is likely; crosses are the
+    PoIs, and triangles the robots.
+    """
+    shown = [states[round(i)] for i in np.linspace(0, len(states) - 1, min(4, len(states)))]
+    figure = Figure(figsize=(3.4 * len(shown), 3.6), layout="compressed")
+    half = config.arena.side / 2
+    for ax, state in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
+        grid, slots, layout = state.grid, state.slots, state.scene.layout
+        floor = np.select([grid.evidence > 0, grid.evidence < 0], [0.1, 1.0], 0.6)
+        seen = np.any(grid.seen, axis=0)
+        floor[(grid.evidence < 0) & ~seen] = 0.85
+        extent = (-half, half, -half, half)
+        ax.imshow(floor.T, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
+        for x, y, yaw, long in layout.walls:
+            ends = long * np.array([-1, 1])
+            ax.plot(x + ends * np.cos(yaw), y + ends * np.sin(yaw), color=SOFT, linewidth=0.8)
+        ax.plot(*layout.position[layout.present].T, "k+", markersize=5)
+        probabilities = np.asarray(jax.vmap(fusion.class_probabilities)(slots.belief))
+        for slot in np.flatnonzero(slots.is_used):
+            width, axes = np.linalg.eigh(slots.covariance[slot])
+            best = int(np.argmax(probabilities[slot]))
+            is_likely = probabilities[slot, best] > _LIKELY
+            label = config.arena.classes[best]
+            colour = class_colour(config.arena, label) if is_likely else SOFT
+            turn = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
+            size = 2 * config.arena.poi_radius + 4 * np.sqrt(width[::-1])
+            ax.add_patch(
+                Ellipse(slots.position[slot], *size, angle=turn, fill=False, edgecolor=colour)
+            )
+        for (x, y, yaw), modality in zip(state.scene.poses, config.modality_of_robot, strict=True):
+            marker = (3, 0, float(np.degrees(yaw)) - 90)
+            ax.plot(x, y, marker=marker, markersize=9, color=modality_colour(modality))
+        ax.set(xlim=(-half, half), ylim=(-half, half), title=f"{float(state.time):.0f} s")
+        ax.set(xticks=[], yticks=[])
+    return figure

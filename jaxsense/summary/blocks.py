@@ -247,6 +247,50 @@ class Evaluation(TypedDict):
     mission: Missions
 
 
+class Gospa(TypedDict):
+    """`found.POLICY.gospa`, with a cutoff of .3 m and p = 1, in metres a mission."""
+
+    total: Annotated[float, Metric("GOSPA [m]", "Sum of the three errors of the map.")]
+    localisation: Annotated[float, Metric("of places [m]")]
+    missed: Annotated[float, Metric("of what is missing [m]")]
+    false: Annotated[float, Metric("of what is not there [m]")]
+
+
+class PositionError(TypedDict):
+    """`found.POLICY.position_error`, of the PoIs found."""
+
+    median: Annotated[Maybe, Metric("off, median [m]")]
+    p95: Annotated[Maybe, Metric("off, 95 % [m]")]
+
+
+class Existence(TypedDict):
+    """`found.POLICY.existence`: probabilities that slots hold an object."""
+
+    nll: Annotated[float, Metric("NLL of existence", "Mean -log p of whether there is one.")]
+    calibration: Annotated[float, Metric("existence, excess", "Mean probability less share.")]
+
+
+class Found(TypedDict):
+    """`found.POLICY`: missions of `explore`, for each PoI; late ones count with all their time."""
+
+    found: Annotated[float, Metric("found", "PoIs that the map shows within .3 m.")]
+    false: Annotated[float, Metric("false", "Objects on the map that are none.")]
+    duplicates: Annotated[float, Metric("duplicates", "Further objects for one PoI.")]
+    right: Annotated[float, Metric("right", "PoIs found whose most likely class is right.")]
+    confidence: Annotated[float, Metric("confidence", "Mean, of the most likely class.")]
+    observations_per_poi: Annotated[float, Metric("looks per PoI", digits=2)]
+    mean_time_s: Annotated[float, Metric("mean time [s]", digits=1)]
+    time_over_known: Annotated[float, Metric("time over known", "Known: all places are told.", 2)]
+    late: Annotated[float, Metric("late", "Share of missions that the time limit ends.")]
+    collisions: Annotated[int, Metric("collisions", "Control periods with contact.", 0)]
+    position_error: PositionError
+    gospa: Gospa
+    existence: Existence
+    overflow: Annotated[int, Metric("left out", "Candidates for which the map had no slot.", 0)]
+    found_and_right: Annotated[list[float], Metric("over time", "Found and right, every 10 s.")]
+    episodes: Annotated[int, Metric("missions", digits=0)]
+
+
 class Header(Origin):
     """The keys of a summary about the run itself."""
 
@@ -287,7 +331,7 @@ def _table(block: type) -> dict[str, Metric]:
 
 
 DETECTORS, JMVAE, BELIEF, AGENTS = map(_table, (Detector, Jmvae, Beliefs, Agent))
-MISSIONS, STAGES = _table(Case), _table(StageTiming)
+MISSIONS, STAGES, FOUND = map(_table, (Case, StageTiming, Found))
 BLOCKS = {
     "": _table(Header),
     "timing.": _table(Timing),
@@ -298,6 +342,7 @@ BLOCKS = {
     "dqn.MODALITY.": AGENTS,
     "mission.POLICY.": MISSIONS,
     "evaluations.NAME.": _table(Evaluation),
+    "found.POLICY.": FOUND,
 }
 """All metrics, by the prefix of their key in `summary.json` and then by the rest of it. Evaluations
-have files `evaluations/NAME.json`, each with its own block `mission`."""
+have files `evaluations/NAME.json`, each with its own block `mission`; `explore` writes `found`."""

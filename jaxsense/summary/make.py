@@ -146,3 +146,50 @@ def _calibration(found: Measured) -> blocks.Calibration:
 def _share(part: int, whole: int) -> float | None:
     """Share of a whole; None if that is 0."""
     return float(part / whole) if whole else None
+
+
+def found(
+    metrics: Measured, known: Measured, over_time: Sequence[float], limit: float
+) -> blocks.Found:
+    """A policy's block `found`, from metrics of its missions, see `exploration.measure`.
+
+    Args:
+      known: metrics of missions in the same arenas, all places of which the robots are told.
+      over_time: what becomes `found_and_right`.
+      limit: of the time of a mission, in seconds.
+    """
+    number, gospa, seconds = metrics["present"].sum(), metrics["gospa"], metrics["time_s"]
+    off = metrics["off"][np.isfinite(metrics["off"])]
+    is_used = np.isfinite(metrics["existence"])
+    probability, is_object = metrics["existence"][is_used], metrics["is_object"][is_used]
+    of_truth = np.where(is_object, probability, 1 - probability)
+    is_found = max(metrics["found"].sum(), 1)
+    return {
+        "found": float(metrics["found"].sum() / number),
+        "false": float(metrics["false"].sum() / number),
+        "duplicates": float(gospa.duplicates.sum() / number),
+        "right": float(metrics["right"].sum() / is_found),
+        "confidence": float(metrics["confidence"].sum() / is_found),
+        "observations_per_poi": float(metrics["looks"].sum() / number),
+        "mean_time_s": float(seconds.mean()),
+        "time_over_known": float(seconds.mean() / known["time_s"].mean()),
+        "late": float(np.mean(seconds >= limit)),
+        "collisions": int(metrics["collisions"].sum()),
+        "position_error": {
+            "median": float(np.median(off)) if len(off) else None,
+            "p95": float(np.quantile(off, 0.95)) if len(off) else None,
+        },
+        "gospa": {
+            "total": float(gospa.total.mean()),
+            "localisation": float(gospa.localisation.mean()),
+            "missed": float(gospa.missed.mean()),
+            "false": float(gospa.false.mean()),
+        },
+        "existence": {
+            "nll": float(-np.log(of_truth).mean()) if len(of_truth) else 0.0,
+            "calibration": float(probability.mean() - is_object.mean()) if len(of_truth) else 0.0,
+        },
+        "overflow": int(metrics["overflow"].sum()),
+        "found_and_right": list(over_time),
+        "episodes": len(seconds),
+    }

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from jaxsense import PRESETS, demo, evaluate, export, task_list, train
+from jaxsense import PRESETS, demo, evaluate, explore, export, task_list, train
 from jaxsense.config import options
 from jaxsense.run import cli
 from jaxsense.run.settings import Settings
@@ -16,7 +16,7 @@ PARSE = {"train": (train.parse, DEFAULT)} | {
         lambda argv, module=module: cli.parse(module.PROGRAM, module.Arguments, argv),
         module.Arguments,
     )
-    for module in (evaluate, export, demo, task_list)
+    for module in (evaluate, explore, export, demo, task_list)
 }
 """How each command reads a command line, and the dataclass of its options."""
 # `--help` and paths that exist would do something.

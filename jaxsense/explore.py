@@ -1,0 +1,185 @@
+"""`jaxsense explore`: plays missions in places that the robots do not know."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxsense import exploration, mission
+from jaxsense.config import Config
+from jaxsense.config.mission import CONTROL_PERIOD
+from jaxsense.config.options import Positional
+from jaxsense.config.section import Checked, limited, require_known
+from jaxsense.core.types import Key
+from jaxsense.exploration import ExplorationState
+from jaxsense.models import Models
+from jaxsense.run import cli, devices, files, output, rundir
+from jaxsense.run.output import say
+from jaxsense.run.settings import MAX_SEED
+from jaxsense.show import drawing, plots
+from jaxsense.show.terminal import Display
+from jaxsense.summary import blocks, make
+from jaxsense.summary.compare import Measured
+from jaxsense.summary.tables import of_metrics
+
+PROGRAM = "jaxsense.explore"
+_CHUNK = 100  # control periods between two reports
+_KNOWN = "nearest"  # policy of the missions with known places
+_SHOWN = "found", "false", "duplicates", "right", "position_error.median", "mean_time_s"
+
+
+class PlaceArguments(Checked, place="arena"):
+    """What robots explore.
+
+    Attributes:
+      side: Side of the arena, in metres.
+      num_pois: Largest number of points of interest.
+      fewest_pois: Smallest number.
+      inner_walls: Number of inner walls.
+    """
+
+    side: float = 8.0
+    num_pois: int = 12
+    fewest_pois: int = 4
+    inner_walls: int = 5
+
+
+class Arguments(Checked):
+    """Plays missions in which robots find points of interest and walls, and compares policies.
+
+    Attributes:
+      run: The directory of a finished run, `latest` for the newest one in `runs/`, or
+        `pretrained:PRESET` for models that ship.
+      episodes: Number of missions per policy.
+      seed: Seed of the arenas and of all noise, from 0 to 2^32 - 1.
+      policy: `explore_first`, `look_first`, `nearest` or `gain_rate`; or `all`.
+      robots: Sensors of the robots, one per robot; the run's by default.
+      time_limit: Maximum length of a mission, in seconds.
+      out: Directory for figures and pictures, new or empty; by default `runs/DATE-TIME-explore`.
+      cache: Directory in which to cache compiled programs; `none` for no cache.
+      trust: Trust the run's `config.json`: run the code of custom sensors that it names.
+    """
+
+    run: Positional[Path] = Path("pretrained:default")
+    episodes: int = limited(32, at_least=1, at_most=8192)
+    seed: int = limited(0, at_least=0, at_most=MAX_SEED)
+    policy: str = "all"
+    arena: PlaceArguments = PlaceArguments()
+    robots: tuple[str, ...] | None = None
+    time_limit: float = limited(600.0, at_least=CONTROL_PERIOD, at_most=3600)
+    out: Path | None = None
+    cache: Path | None = cli.CACHE
+    trust: bool = False
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Runs the program.
+
+    Args:
+      argv: the command line without the program; by default the process's own.
+    """
+    arguments = cli.parse(PROGRAM, Arguments, argv)
+    with cli.ending(PROGRAM):
+        devices.start(1)
+        trained, models = rundir.load(arguments.run, arguments.trust)
+        config = _elsewhere(arguments, trained)
+        require_known("policy", arguments.policy, (*exploration.POLICIES, "all"))
+        names = [*exploration.POLICIES] if arguments.policy == "all" else [arguments.policy]
+        cli.keep_programs(PROGRAM, arguments.cache, config)
+        play = Explorations(config, models, arguments.episodes, arguments.seed)
+        with rundir.begun(arguments.out, "explore") as place, Display() as display:
+            report = functools.partial(display.show, metrics={})
+            known = play.known(functools.partial(report, "known places"))
+            found = dict[str, blocks.Found]()
+            for name in names:
+                measured, over_time, shown = play.policy(name, functools.partial(report, name))
+                limit = config.mission.time_limit
+                found[name] = make.found(measured, known, over_time, limit)
+                picture = drawing.svg(plots.explored(config, models.fusion, shown))
+                files.write(place / f"explored-{name}.svg", picture)
+            content = {**rundir.origin(), "seed": arguments.seed, "found": found}
+            rundir.write_json(place / "found.json", content)
+    metrics = [blocks.FOUND[key] for key in (*_SHOWN, "time_over_known", "late", "collisions")]
+    say(str(of_metrics(f"{arguments.episodes} missions of each policy", found, metrics)))
+    if missing := sum(each["overflow"] for each in found.values()):
+        cli.warn(PROGRAM, f"the map had no slot for {missing} candidates; raise arena.num_pois")
+    say(f"All figures are in {place / 'found.json'}; pictures of the first mission beside it.")
+
+
+class Explorations:
+    """Missions of all policies in the same arenas, side by side, with one program for all."""
+
+    def __init__(self, config: Config, models: Models, episodes: int, seed: int):
+        """Draws the arenas.
+
+        Raises:
+          ConfigError: if missions cannot begin in such arenas.
+        """
+        begin_key, self._key = jax.random.split(jax.random.key(seed))
+        self._scenario, self._models = mission.make_mission(config), models
+        self._chunks = math.ceil(config.mission.time_limit / CONTROL_PERIOD / _CHUNK)
+        reset = jax.vmap(lambda key: exploration.reset(key, self._scenario, models))
+        self._begun = jax.jit(reset)(jax.random.split(begin_key, episodes))
+
+    def known(self, report: Callable[[int, int], None]) -> Measured:
+        """Metrics of missions whose robots are told all places."""
+        tell = jax.vmap(lambda state: exploration.told(self._scenario, state))
+        *_, (metrics, _) = self._play(_KNOWN, jax.jit(tell)(self._begun), report)
+        return metrics
+
+    def policy(
+        self, name: str, report: Callable[[int, int], None]
+    ) -> tuple[Measured, list[float], list[ExplorationState]]:
+        """Metrics of a policy; after each chunk, the share of PoIs found and right, and a state."""
+        chunks = [*self._play(name, self._begun, report)]
+        present = chunks[-1][0]["present"].sum()
+        right = [float(metrics["right"].sum() / present) for metrics, _ in chunks]
+        states = [state for _, state in chunks]
+        over = next((i for i, state in enumerate(states) if state.done), len(states))
+        return chunks[-1][0], right, states[: over + 1]
+
+    def _play(
+        self, name: str, states: ExplorationState, report: Callable[[int, int], None]
+    ) -> Iterator[tuple[Measured, ExplorationState]]:
+        """Metrics and the first mission after each chunk, until all missions are done."""
+        report(0, 0)
+        index = jnp.int32([*exploration.POLICIES].index(name))
+        for chunk in range(self._chunks):
+            states, metrics = self._go_on(index, jax.random.fold_in(self._key, chunk), states)
+            done = np.asarray(states.done)
+            report(int(done.sum()), len(done))
+            yield jax.tree.map(np.asarray, (metrics, jax.tree.map(lambda x: x[0], states)))
+            if done.all():
+                return
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def _go_on(
+        self, index: Int[Array, ""], key: Key, states: ExplorationState
+    ) -> tuple[ExplorationState, Measured]:
+        """Plays a chunk of all missions with the policy of an index."""
+        models = self._models
+
+        def policy(key: Key, models: Models, options: exploration.Options) -> jax.Array:
+            return jax.lax.switch(index, [*exploration.POLICIES.values()], key, models, options)
+
+        keys = jax.random.split(key, len(states.done))
+        after = exploration.rollout_batch(keys, self._scenario, models, policy, states, _CHUNK)
+        return after, jax.vmap(lambda state: exploration.measure(models, state))(after)
+
+
+def _elsewhere(arguments: Arguments, config: Config) -> Config:
+    """The run's settings with the places and the team of these missions."""
+    arena = dataclasses.replace(config.arena, **vars(arguments.arena))
+    limit = dataclasses.replace(config.mission, time_limit=arguments.time_limit)
+    robots = config.robots if arguments.robots is None else arguments.robots
+    return dataclasses.replace(config, arena=arena, mission=limit, robots=robots)
+
+
+if __name__ == "__main__":
+    output.run(main)
