@@ -73,9 +73,11 @@ def nearest(key: Key, models: Models, options: Options) -> Float[Array, " A+1"]:
 
 
 def gain_rate(key: Key, models: Models, options: Options) -> Float[Array, " A+1"]:
-    """Takes the highest gain a second; a look that pays counts as 2 m2 of unseen floor."""
+    """Takes the most a second; a look that pays counts as 1 m2 of unseen floor, 4 m2 as two."""
     del key, models
-    return _ranked(options, jnp.where(options.is_look, 2.0, options.gain) / _cost(options))
+    return _ranked(
+        options, jnp.where(options.is_look, 1.0, jnp.sqrt(options.gain)) / _cost(options)
+    )
 
 
 POLICIES: dict[str, Policy] = {

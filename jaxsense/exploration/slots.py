@@ -22,6 +22,7 @@ _DRIFT = 1e-5  # m2 a scan; errors that scans share, such as those of poses, do 
 _FAR = 1e3  # m, where no robot comes near
 _SUREST = 10.0  # log-odds; more would hold out against too many misses
 _SURE = 3.0  # log-odds; slots below its negative are cleared
+_FIRST = -2.0  # log-odds; of candidates that no other scan confirms, 7 % are objects
 
 
 Number = Float[Array, ""] | float
@@ -32,7 +33,7 @@ class Slots:
     """S slots for objects; unused ones are far away and hold the prior.
 
     Attributes:
-      existence: log-odds that there is an object; 0 at its first candidate.
+      existence: log-odds that there is an object.
       position: in metres.
       covariance: of the position, in square metres.
       belief: `[S, D]`.
@@ -172,8 +173,9 @@ def with_candidates(
     odds = jnp.logaddexp(jnp.log1p(-detection), jnp.log(detection / clutter) + log_density)
     existence = jnp.minimum(slots.existence + odds, _SUREST)
     known = dataclasses.replace(known, existence=existence)
-    places = {"position": seen.position, "covariance": seen.covariance}
-    new = dataclasses.replace(slots, is_used=jnp.ones(number, bool), **places)
+    first_seen = {"position": seen.position, "covariance": seen.covariance}
+    first_seen |= {"existence": jnp.full(number, _FIRST), "is_used": jnp.ones(number, bool)}
+    new = dataclasses.replace(slots, **first_seen)
     after = _where(own < most, _where(is_free, new, known), slots)
     overflow = slots.overflow + jnp.maximum(jnp.sum(is_new) - jnp.sum(is_free), 0)
     return dataclasses.replace(after, overflow=overflow)

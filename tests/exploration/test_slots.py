@@ -56,7 +56,7 @@ def test_an_update_as_worked_by_hand():
     assert found.covariance[0] == pytest.approx(np.diag([2e-4, 3e-4]), abs=1e-9)
     # The squared distance is .0004 / .0008 + .0016 / .0016 = 1.5.
     density = np.exp(-0.75) / (2 * np.pi * np.sqrt(8e-4 * 1.6e-3))
-    assert found.existence[0] == pytest.approx(np.log(0.1 + 0.9 * density / 50), rel=1e-4)
+    assert found.existence[0] == pytest.approx(-2 + np.log(0.1 + 0.9 * density / 50), rel=1e-4)
 
 
 def test_an_object_is_taken_away_and_its_slot_is_empty():

@@ -102,8 +102,10 @@ def test_rules_choose_by_hand_worked_numbers():
     )
     key, taken = jax.random.key(0), dataclasses.replace(chosen, is_taken=jnp.arange(4) == 1)
     best = {n: int(jnp.argmax(f(key, MODELS, chosen))) for n, f in exploration.POLICIES.items()}
-    # A second: 2 / 9, 1 / 4 and 8 / 19.
-    assert best == {"explore_first": 1, "look_first": 0, "nearest": 1, "gain_rate": 2}
+    # A second: 1 / 9, 1 / 4 and 8 ** 0.5 / 19, and then 25 ** 0.5 / 19.
+    assert best == {"explore_first": 1, "look_first": 0, "nearest": 1, "gain_rate": 1}
+    large = dataclasses.replace(chosen, gain=jnp.array([0.5, 1.0, 25.0, 9.0]))
+    assert jnp.argmax(exploration.POLICIES["gain_rate"](key, MODELS, large)) == 2
     assert jnp.argmax(exploration.POLICIES["nearest"](key, MODELS, taken)) == 0
     nothing = dataclasses.replace(chosen, is_possible=jnp.zeros(4, bool))
     for policy in exploration.POLICIES.values():
