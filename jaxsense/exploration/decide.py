@@ -12,6 +12,7 @@ from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core.types import Index, Key, others, pytree
 from jaxsense.dqn.policies import best
 from jaxsense.exploration import grid as grids
+from jaxsense.exploration import proposals
 from jaxsense.exploration import slots as objects
 from jaxsense.exploration.grid import Grid
 from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
@@ -34,7 +35,8 @@ class Options:
     """What a robot can do: look at one of S slots, or drive to one of F frontiers, `[S + F]` each.
 
     Attributes:
-      gain: of a look in nats; of a frontier, its unseen floor in m2.
+      gain: of a look in nats; of a frontier, its unseen floor in m2, times what the robot's sensor
+        sees at once as a share of the most that one of the team sees.
       seconds: until it is done.
       goal: x [m], y [m] and yaw [rad] in which to end.
       is_possible: whether there is such an option, and a path to it.
@@ -154,7 +156,9 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
     is_taken = jnp.where(is_look[:, None], is_same & same_sensor[None], beside & explores[None])
     length = jnp.append(to_view, frontiers.distance)
     return Options(
-        gain=jnp.append(jnp.where(is_open, values, 0.0), frontiers.size),
+        gain=jnp.append(
+            jnp.where(is_open, values, 0.0), frontiers.size * _shares(mission)[modality]
+        ),
         seconds=length / amiro.MAX_SPEED
         + jnp.where(is_look, LOOK_SECONDS + _TURN_SECONDS, _TURN_SECONDS),
         goal=goal,
@@ -162,6 +166,17 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
         is_taken=jnp.any(is_taken, axis=-1),
         is_look=is_look,
     )
+
+
+def _shares(mission: Mission) -> Float[Array, " M"]:
+    """Floor in view of each modality, as a share of the most that a robot of the team has."""
+    radius = mission.config.arena.poi_radius
+    floor = [
+        sensor.field_of_view * proposals.reach(sensor, radius) ** 2
+        for sensor in mission.world.sensors
+    ]
+    most = max(floor[modality] for modality in mission.config.modality_of_robot)
+    return jnp.array(floor) / most
 
 
 def blocked(mission: Mission, state: ExplorationState, robot: Index) -> Float[Array, "P 3"]:
