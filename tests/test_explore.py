@@ -12,6 +12,7 @@ from jaxsense import exploration, explore, load_pretrained, mission
 from jaxsense.exploration.slots import Gospa
 from jaxsense.show import plots
 from jaxsense.summary import make
+from jaxsense.summary.blocks import FOUND
 
 SMALL = ["--arena.side", "4", "--arena.num-pois", "3", "--arena.fewest-pois", "3"]
 
@@ -48,6 +49,8 @@ def test_figures_of_two_missions_by_hand():
     assert block["existence"]["nll"] == pytest.approx(nll)
     assert block["gospa"]["total"] == pytest.approx(0.3)
     assert block["found_and_right"] == [0.2, 0.4]
+    assert all(metric.value(block) is not None for metric in FOUND.values())
+    assert {key.partition(".")[0] for key in FOUND} == set(block)
 
 
 def test_the_picture_shows_what_robots_know_before_what_is_there():
