@@ -45,6 +45,7 @@ _MOST = 20  # ellipses of a class
 _CLASS_ROW = 0.24  # inches, of a class in the plot of sigma
 _LOOK_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
+_HEADING = 0.4  # m
 _LIKELY = 0.9  # probability of a class that has a colour on the map
 _MIN_LOOKS = 20  # in a bin of the calibration
 _REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
@@ -291,9 +292,9 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
 def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState]) -> Figure:
     """One mission in an unknown place, at four times: what robots know, before what is there.
 
-    Grey is unknown, white is free, black is a wall; floor that no sensor has seen is hatched.
+    Grey is unknown, white is free, black is a wall; light grey is free floor that nothing has seen.
     Ellipses are 2 sigma of the objects on the map, coloured once a class is likely; crosses are the
-    PoIs, and triangles the robots.
+    PoIs, dots the robots, with their headings.
     """
     shown = [states[round(i)] for i in np.linspace(0, len(states) - 1, min(4, len(states)))]
     figure = Figure(figsize=(3.4 * len(shown), 3.6), layout="compressed")
@@ -322,8 +323,10 @@ def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState])
                 Ellipse(slots.position[slot], *size, angle=turn, fill=False, edgecolor=colour)
             )
         for (x, y, yaw), modality in zip(state.scene.poses, config.modality_of_robot, strict=True):
-            marker = (3, 0, float(np.degrees(yaw)) - 90)
-            ax.plot(x, y, marker=marker, markersize=9, color=modality_colour(modality))
+            ahead = x + _HEADING * np.cos(yaw), y + _HEADING * np.sin(yaw)
+            colour = modality_colour(modality)
+            ax.plot(*zip((x, y), ahead, strict=True), color=colour)
+            ax.plot(x, y, "o", color=colour)
         ax.set(xlim=(-half, half), ylim=(-half, half), title=f"{float(state.time):.0f} s")
         ax.set(xticks=[], yticks=[])
     return figure
