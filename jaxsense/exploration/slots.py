@@ -22,7 +22,7 @@ _DRIFT = 1e-5  # m2 a scan; errors that scans share, such as those of poses, do 
 _FAR = 1e3  # m, where no robot comes near
 _SUREST = 10.0  # log-odds; more would hold out against too many misses
 _SURE = 3.0  # log-odds; slots below its negative are cleared
-_FIRST = -2.0  # log-odds; of candidates that no other scan confirms, 7 % are objects
+_FIRST = -2.0  # log-odds; of candidates that no other scan confirms, few are objects
 
 
 Number = Float[Array, ""] | float

@@ -274,7 +274,7 @@ class Found(TypedDict):
     """`found.POLICY`: missions of `explore`, for each PoI; late ones count with all their time."""
 
     found: Annotated[float, Metric("found", "PoIs that the map shows within .3 m.")]
-    false: Annotated[float, Metric("false", "Objects on the map that are none.")]
+    false: Annotated[float, Metric("false", "Objects on the map that are none, or duplicates.")]
     duplicates: Annotated[float, Metric("duplicates", "Further objects for one PoI.")]
     right: Annotated[float, Metric("right", "PoIs found whose most likely class is right.")]
     confidence: Annotated[float, Metric("confidence", "Mean, of the most likely class.")]
