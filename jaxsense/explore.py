@@ -13,7 +13,7 @@ from jaxtyping import Array, Int
 
 from jaxsense import exploration, mission
 from jaxsense.config import Config
-from jaxsense.config.mission import CONTROL_PERIOD
+from jaxsense.config.mission import CONTROL_PERIOD, LocalisationConfig
 from jaxsense.config.options import Positional
 from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.core.types import Key
@@ -40,13 +40,13 @@ class PlaceArguments(Checked, place="arena"):
     Attributes:
       side: Side of the arena, in metres.
       num_pois: Largest number of points of interest.
-      fewest_pois: Smallest number.
+      fewest_pois: Smallest number; by default 4, or `num_pois` if that is less.
       inner_walls: Number of inner walls.
     """
 
     side: float = 8.0
     num_pois: int = 12
-    fewest_pois: int = 4
+    fewest_pois: int | None = limited(None, at_least=1)
     inner_walls: int = 5
 
 
@@ -93,6 +93,9 @@ def main(argv: list[str] | None = None) -> None:
         names = [*exploration.POLICIES] if arguments.policy == "all" else [arguments.policy]
         cli.keep_programs(PROGRAM, arguments.cache, config)
         play = Explorations(config, models, arguments.episodes, arguments.seed)
+        played = {"run": str(arguments.run), "seed": arguments.seed, "robots": config.carried}
+        arena = {name: getattr(config.arena, name) for name in vars(arguments.arena)}
+        played |= {"arena": arena, "time_limit": arguments.time_limit}
         with rundir.begun(arguments.out, "explore") as place, Display() as display:
             report = functools.partial(display.show, metrics={})
             known = play.known(functools.partial(report, "known places"))
@@ -103,12 +106,12 @@ def main(argv: list[str] | None = None) -> None:
                 found[name] = make.found(measured, known, over_time, limit)
                 picture = drawing.svg(plots.explored(config, models.fusion, shown))
                 files.write(place / f"explored-{name}.svg", picture)
-            content = {**rundir.origin(), "seed": arguments.seed, "found": found}
-            rundir.write_json(place / "found.json", content)
+                content = {**rundir.origin(), **played, "found": found}
+                rundir.write_json(place / "found.json", content)
     metrics = [blocks.FOUND[key] for key in (*_SHOWN, "time_over_known", "late", "collisions")]
     say(str(of_metrics(f"{arguments.episodes} missions of each policy", found, metrics)))
     if missing := sum(each["overflow"] for each in found.values()):
-        cli.warn(PROGRAM, f"the map had no slot for {missing} candidates; raise arena.num_pois")
+        cli.warn(PROGRAM, f"{missing} times, a candidate found no slot on the map")
     say(f"All figures are in {place / 'found.json'}; pictures of the first mission beside it.")
 
 
@@ -116,7 +119,7 @@ class Explorations:
     """Missions of all policies in the same arenas, side by side, with one program for all."""
 
     def __init__(self, config: Config, models: Models, episodes: int, seed: int):
-        """Draws the arenas.
+        """Missions that have not begun.
 
         Raises:
           ConfigError: if missions cannot begin in such arenas.
@@ -124,8 +127,14 @@ class Explorations:
         begin_key, self._key = jax.random.split(jax.random.key(seed))
         self._scenario, self._models = mission.make_mission(config), models
         self._chunks = math.ceil(config.mission.time_limit / CONTROL_PERIOD / _CHUNK)
-        reset = jax.vmap(lambda key: exploration.reset(key, self._scenario, models))
-        self._begun = jax.jit(reset)(jax.random.split(begin_key, episodes))
+        self._begin_keys = jax.random.split(begin_key, episodes)
+        self._reset = jax.vmap(lambda key: exploration.reset(key, self._scenario, models))
+        jax.eval_shape(self._reset, self._begin_keys)
+
+    @functools.cached_property
+    def _begun(self) -> ExplorationState:
+        """The arenas, and what robots know of them."""
+        return jax.jit(self._reset)(self._begin_keys)
 
     def known(self, report: Callable[[int, int], None]) -> Measured:
         """Metrics of missions whose robots are told all places."""
@@ -175,10 +184,17 @@ class Explorations:
 
 def _elsewhere(arguments: Arguments, config: Config) -> Config:
     """The run's settings with the places and the team of these missions."""
-    arena = dataclasses.replace(config.arena, **vars(arguments.arena))
-    limit = dataclasses.replace(config.mission, time_limit=arguments.time_limit)
-    robots = config.robots if arguments.robots is None else arguments.robots
-    return dataclasses.replace(config, arena=arena, mission=limit, robots=robots)
+    fewest = arguments.arena.fewest_pois or min(4, arguments.arena.num_pois)
+    places = {**vars(arguments.arena), "fewest_pois": fewest}
+    if config.mission.localisation != LocalisationConfig() or config.mission.communication.own_maps:
+        cli.warn(PROGRAM, "robots know their poses and share one map, other than in the run")
+    return dataclasses.replace(
+        config,
+        arena=dataclasses.replace(config.arena, **places),
+        mission=dataclasses.replace(config.mission, time_limit=arguments.time_limit),
+        mdp=dataclasses.replace(config.mdp, partly_seen_starts=False),
+        robots=config.robots if arguments.robots is None else arguments.robots,
+    )
 
 
 if __name__ == "__main__":

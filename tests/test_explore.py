@@ -14,7 +14,7 @@ from jaxsense.show import plots
 from jaxsense.summary import make
 from jaxsense.summary.blocks import FOUND
 
-SMALL = ["--arena.side", "4", "--arena.num-pois", "3", "--arena.fewest-pois", "3"]
+SMALL = ["--arena.side", "4", "--arena.num-pois", "3"]
 
 
 def test_figures_of_two_missions_by_hand():
@@ -36,6 +36,8 @@ def test_figures_of_two_missions_by_hand():
         "looks": np.array([7, 3]),
         "collisions": np.array([0, 0]),
     }
+    late = make.found(metrics, {"time_s": np.array([100.0, 600.0])}, [0.2], 600.0)
+    assert late["time_over_known"] is None
     block = make.found(metrics, {"time_s": np.array([100.0, 120.0])}, [0.2, 0.4], 600.0)
     assert block["found"] == pytest.approx(3 / 5)
     assert block["false"] == block["duplicates"] == pytest.approx(1 / 5)
@@ -76,6 +78,7 @@ def test_the_picture_shows_what_robots_know_before_what_is_there():
         (["--episodes", "0"], "episodes = 0: must be a whole number, from 1 to 8,192"),
         (["--arena.fewest-pois", "13"], "arena.fewest_pois = 13"),
         (["--robots", "camera", "camera"], "robots = ('camera', 'camera')"),
+        (["--arena.num-pois", "0"], "arena.num_pois = 0"),
         (["--robots", "sonar"], "robots = ('sonar',)"),
         (["no/such/run"], "no/such/run"),
         (["--out", "full"], "out = 'full': is not empty; must be a new or empty directory"),
@@ -95,7 +98,10 @@ def test_what_cannot_be_explored_is_refused_and_changes_nothing(
 def test_missions_end_in_figures_and_pictures(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     explore.main([*SMALL, "--episodes", "2", "--time-limit", "150", "--out", "here"])
-    found = json.loads((tmp_path / "here" / "found.json").read_text())["found"]
+    content = json.loads((tmp_path / "here" / "found.json").read_text())
+    found, arena = content["found"], content["arena"]
+    assert content["robots"] == ["camera", "lidar"]
+    assert arena == {"side": 4.0, "num_pois": 3, "fewest_pois": 3, "inner_walls": 5}
     assert [*found] == [*exploration.POLICIES]
     for name, block in found.items():
         assert block["found"] >= 5 / 6

@@ -133,7 +133,7 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
     """What a robot can do."""
     pose, modality = state.scene.poses[robot], mission.modalities[robot]
     lengths = grids.distances(state.grid, pose[:2], blocked(mission, state, robot))
-    frontiers = grids.frontiers(state.grid, lengths, NUM_FRONTIERS)
+    frontiers = grids.frontiers(state.grid, modality, lengths, NUM_FRONTIERS)
     views, to_view = _views(mission, models, state, robot, lengths)
     slots, robots = state.slots, state.robots
     number = len(slots.existence)
@@ -170,13 +170,10 @@ def options_of(mission: Mission, models: Models, state: ExplorationState, robot:
 
 def _shares(mission: Mission) -> Float[Array, " M"]:
     """Floor in view of each modality, as a share of the most that a robot of the team has."""
-    radius = mission.config.arena.poi_radius
-    floor = [
-        sensor.field_of_view * proposals.reach(sensor, radius) ** 2
-        for sensor in mission.world.sensors
-    ]
-    most = max(floor[modality] for modality in mission.config.modality_of_robot)
-    return jnp.array(floor) / most
+    narrowest = mission.config.arena.poi_half_width
+    sensors = mission.world.sensors
+    floor = jnp.stack([x.field_of_view * proposals.reach(x, narrowest) ** 2 for x in sensors])
+    return floor / jnp.max(floor[mission.modalities])
 
 
 def blocked(mission: Mission, state: ExplorationState, robot: Index) -> Float[Array, "P 3"]:

@@ -4,6 +4,7 @@ Cell `[i, j]` of K x K lies at the i-th x and the j-th y, from the corner at x =
 outer walls are its border. Functions take one grid.
 """
 
+import dataclasses
 import math
 
 import jax
@@ -53,11 +54,13 @@ class Grid:
       evidence: that a cell is occupied: log-odds in units of one scan that crosses the cell; 0 if
         unknown.
       seen: floor where each of M modalities would have noticed a PoI.
+      given_up: floor at which robots of each modality look no more.
       side: of the arena, in metres; static.
     """
 
     evidence: Int8[Array, "K K"]
     seen: Bool[Array, "M K K"]
+    given_up: Bool[Array, "M K K"]
     side: float = struct.field(pytree_node=False)
 
     @property
@@ -126,7 +129,8 @@ def num_cells(side: float) -> int:
 def empty(side: float, modalities: int) -> Grid:
     """The grid of an unknown arena."""
     evidence = jnp.zeros((num_cells(side),) * 2, jnp.int8)
-    return Grid(evidence, jnp.zeros((modalities, *evidence.shape), bool), side)
+    nothing = jnp.zeros((modalities, *evidence.shape), bool)
+    return Grid(evidence, nothing, nothing, side)
 
 
 def with_scan(
@@ -164,7 +168,7 @@ def with_scan(
     evidence = jnp.clip(grid.evidence + change, -_MOST, _MOST).astype(jnp.int8)
     seen = grid.seen.at[modality].set(grid.seen[modality] | (is_crossed & (distance <= reach)))
     is_known = _is_in(grid, ignore, jnp.full(len(ignore), _UNDER))
-    return Grid(evidence, seen | is_known[None], grid.side)
+    return dataclasses.replace(grid, evidence=evidence, seen=seen | is_known[None])
 
 
 def with_view(
@@ -186,7 +190,7 @@ def with_view(
     first, spacing = -field_of_view / 2, field_of_view / (_RAYS - 1)
     is_crossed, distance = _crossed(grid, pose, first, spacing, ranges)
     is_seen = grid.seen[modality] | (is_crossed & grid.free & (distance <= reach))
-    return Grid(grid.evidence, grid.seen.at[modality].set(is_seen), grid.side)
+    return dataclasses.replace(grid, seen=grid.seen.at[modality].set(is_seen))
 
 
 def is_passable(grid: Grid, blocked: Float[Array, "P 3"]) -> Cells:
@@ -287,8 +291,10 @@ def way(grid: Grid, distances: Lengths, position: Place) -> Place:
     return jnp.where(is_there, ends[last], position)
 
 
-def frontiers(grid: Grid, distances: Lengths, number: int) -> Frontiers:
-    """Places next to floor that no modality has seen, where two by two cells of it have room.
+def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> Frontiers:
+    """Places next to floor that nobody has seen and this modality has not given up.
+
+    Two by two cells of it must have room.
 
     One after the other, the reachable cell in or next to unseen floor with the most of it around,
     where near floor counts more, and no place before it within 1 m. Places with less than .08 m2
@@ -298,7 +304,8 @@ def frontiers(grid: Grid, distances: Lengths, number: int) -> Frontiers:
       distances: of all cells from the robot, in metres, see `distances`.
       number: of places, static.
     """
-    unseen = _squares(~(jnp.any(grid.seen, axis=0) | grid.occupied))
+    left_out = jnp.any(grid.seen, axis=0) | grid.given_up[modality] | grid.occupied
+    unseen = _squares(~left_out)
     reachable = jnp.isfinite(distances)
     cells, area = np.arange(len(distances)), grid.cell**2
     # Whole numbers, so that equal sums are equal everywhere.
@@ -342,7 +349,7 @@ def _is_in(grid: Grid, centres: Float[Array, "P 2"], radii: Float[Array, " P"]) 
 
 
 def _squares(cells: Cells) -> Cells:
-    """Cells in squares of two by two: a PoI has no room in fewer."""
+    """Cells in squares of two by two: a PoI of .1 m has no room in fewer."""
     padded = jnp.pad(cells, 1)
     rows = padded[1:] & padded[:-1]
     whole = rows[:, 1:] & rows[:, :-1]

@@ -19,12 +19,12 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
       `gospa`: see `slots.Gospa`, with p = 1.
       `off`: `[N]` metres between each PoI and its slot, NaN for one that is not found.
       `existence`: `[S]` probabilities, NaN in unused slots.
-      `is_object`: `[S]` whether a PoI is within `CUTOFF` of the slot.
+      `is_object`: `[S]` whether a PoI is within `CUTOFF` of the slot, and no better slot is.
       `present`: number of PoIs.
       `found`: number of PoIs that the map shows within `CUTOFF`.
       `false`: number of objects on the map that are none.
       `right`: number of PoIs found and looked at whose most likely class is the true one.
-      `confidence`: sum of the probabilities of these classes.
+      `confidence`: sum of the probabilities of the most likely classes of those looked at.
       `overflow`: candidates that found no free slot.
       `time_s`: duration, in seconds.
       `looks`: number of all robots, with those that show nothing.
@@ -37,6 +37,7 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
     shown = probabilities.at[result.slot].get(mode="clip")
     apart = jnp.linalg.norm(slots.position[:, None] - layout.position[None], axis=-1)
     off = apart.at[result.slot, jnp.arange(len(is_there))].get(mode="fill", fill_value=jnp.nan)
+    is_own = result.slot[None] == jnp.arange(len(is_found))[:, None]
     is_near = (apart < CUTOFF) & layout.present[None]
     is_seen = jnp.any(slots.times_seen > 0, axis=1).at[result.slot].get(mode="clip")
     is_right = is_there & is_seen & (jnp.argmax(shown, axis=1) == state.classes)
@@ -44,12 +45,12 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
         "gospa": result,
         "off": off,
         "existence": jnp.where(slots.is_used, jax.nn.sigmoid(slots.existence), jnp.nan),
-        "is_object": jnp.any(is_near, axis=1),
+        "is_object": jnp.any(is_near & (is_own | ~is_there[None]), axis=1),
         "present": jnp.sum(layout.present),
         "found": jnp.sum(is_there),
         "false": jnp.sum(is_found) - jnp.sum(is_there),
         "right": jnp.sum(is_right),
-        "confidence": jnp.sum(jnp.where(is_there, jnp.max(shown, axis=1), 0.0)),
+        "confidence": jnp.sum(jnp.where(is_there & is_seen, jnp.max(shown, axis=1), 0.0)),
         "overflow": slots.overflow,
         "time_s": state.time,
         "looks": jnp.sum(state.robots.looks),

@@ -20,6 +20,8 @@ _LEAST, _CLEAR = 2.1, 3.8  # noises of the chroma of a pixel, and of an interval
 _TURN = 0.75, 1.6  # cosine of two hues, that of red and yellow is .61; noises
 _WIDE = 1.15, 0.14  # mean half-width of cylinders and cubes in radii, and its deviation as a share
 
+RGB = 3
+"""Channels of a sensor whose images show bodies."""
 Rows = Shaped[Array | np.ndarray, " A"]
 """One number for each ray of a scan, see `_in_order`."""
 
@@ -51,6 +53,7 @@ def propose(
     circles: Float[Array, "P 3"],
     radius: Float[Array, ""] | float,
     number: int,
+    narrowest: float | None = None,
 ) -> Candidates:
     """Candidates in a whole scan, simulated or recorded.
 
@@ -61,23 +64,33 @@ def propose(
       circles: x, y and radius of bodies that are none, in metres, such as other robots.
       radius: of a cylinder and half the side of a cube, in metres.
       number: C, at most the number of rays; static.
+      narrowest: half the smallest width of a body from any side, in metres; `radius` by default.
     """
     if sensor.measures_distance:
         explained = explained_by(pose, sensor.angles, readings, walls, circles)
-        # A sensor of one's own may leave out what a beam without a return reads.
-        most = jnp.where(sensor.blind > 0, sensor.blind, jnp.inf)
-        return from_ranges(sensor.angles, readings, most, pose, explained, radius, number)
-    if sensor.channels == 3:
+        given = sensor.angles, readings, max_range(sensor), pose, explained, radius, number
+        return from_ranges(*given, narrowest)
+    if sensor.channels == RGB:
         return from_colours(sensor.angles, readings, pose, radius, number)
     none = jnp.zeros(number)
     return _nearest(pose, none > 0, number, none, none, none, none)
 
 
-def reach(sensor: Sensor, radius: float) -> float:
-    """Metres up to which `propose` shows bodies: five beams, or a tenth of a radian, wide."""
+def max_range(sensor: Sensor) -> Float[Array, ""]:
+    """Reading without a return, in metres; a sensor of one's own may have none."""
+    return jnp.where(sensor.blind > 0, sensor.blind, jnp.inf)
+
+
+def reach(sensor: Sensor, narrowest: float) -> Float[Array, ""]:
+    """Metres up to which `propose` shows bodies: five beams, or a tenth of a radian, wide.
+
+    Args:
+      narrowest: half the smallest width of a body, in metres.
+    """
     if sensor.measures_distance:
-        return 2 * radius / (5 * abs(float(sensor.angles[1] - sensor.angles[0])))
-    return 2 * radius / 0.1
+        spacing = abs(float(sensor.angles[1] - sensor.angles[0]))
+        return jnp.minimum(2 * narrowest / (5 * spacing), max_range(sensor))
+    return jnp.asarray(20.0 * narrowest if sensor.channels == RGB else 0.0)
 
 
 def explained_by(
@@ -107,6 +120,7 @@ def from_ranges(
     explained: Bool[Array, " B"],
     radius: Float[Array, ""] | float,
     number: int,
+    narrowest: float | None = None,
 ) -> Candidates:
     """Candidates in a scan of a LiDAR: segments as wide as a body, in front of both neighbours.
 
@@ -137,11 +151,13 @@ def from_ranges(
     middle = _mean(kept[:, None] * _unit(along), first + quarter, last - quarter)
     front = jnp.sum(middle * _unit(bearing), axis=-1)
     half_width = (front + radius) * jnp.sin(angle)
-    distance = front + radius * (0.98 + 0.2 * jnp.clip(half_width / radius - 1.0, 0.0, 0.414))
+    least = radius if narrowest is None else narrowest
+    deep = jnp.clip(half_width, least, radius)  # a body is taken to be as deep as it is wide
+    distance = front + 0.98 * deep + 0.2 * jnp.clip(half_width - radius, 0.0, 0.414 * radius)
 
     slack = spacing[0] * distance
-    # Half a body is 1 to 1.41 radii wide, and what edges make of it.
-    is_wide = (half_width > 0.65 * radius) & (half_width < 1.65 * radius + slack)
+    # Half a body is up to 1.41 radii wide, and what edges make of it.
+    is_wide = (half_width > 0.65 * least) & (half_width < 1.65 * radius + slack)
     depth = jnp.maximum(smooth[first], smooth[last]) - front
     is_body = is_whole & in_front & is_wide & (depth < 2 * radius + 3 * noise)
     is_body &= (smooth < max_range) & (_mean(explained[:, None], first, last)[:, 0] < 0.5)

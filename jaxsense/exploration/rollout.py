@@ -34,7 +34,6 @@ _DECIDING_PERIODS = 20  # of control, after which a robot chooses anew
 _NUM_CANDIDATES = 8
 _DETECTION, _CLUTTER = 0.9, 0.01  # of an object in view; false ones per scan and square metre
 _SHOWN = 0.98  # probability that a look at an object shows it
-_RGB = 3  # channels of a sensor whose images show PoIs
 _RIM = 10.0  # degrees, at the rim of a scan, where it may cut a PoI
 _NEAR = 0.3  # m, around a robot or object, where floor may stay unknown
 _SAMPLES = 16  # of a line of sight
@@ -143,7 +142,7 @@ def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> Expl
 
     It reconsiders, too, once it has turned to a frontier, or if its slot has been cleared. A
     viewpoint that it has not reached is one of a failed look. Floor at a frontier that it has still
-    not seen, or not reached, counts as seen: it is given up.
+    not seen, or not reached, is given up.
     """
     robots, pose = state.robots, state.scene.poses[robot]
     left = decide.lengths_at(state.grid, robots.way[robot], pose[None, :2])[0]
@@ -158,8 +157,8 @@ def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> Expl
     until = jnp.where(is_stuck, state.time + RECOVERY_TIME, robots.backs_off_until[robot])
     modality, floor = mission.modalities[robot], state.grid
     is_given_up = floor.offsets(robots.goal[robot, :2])[2] < _GIVEN_UP
-    seen = floor.seen[modality] | (is_given_up & explores & (ends | is_stuck))
-    floor = dataclasses.replace(floor, seen=floor.seen.at[modality].set(seen))
+    given_up = floor.given_up[modality] | (is_given_up & explores & (ends | is_stuck))
+    floor = dataclasses.replace(floor, given_up=floor.given_up.at[modality].set(given_up))
     works = target < number + NUM_FRONTIERS
     notes = progresses | (there & works) | is_stuck
     state = dataclasses.replace(state, grid=floor)
@@ -217,6 +216,7 @@ def _sense(
         jnp.concatenate([beside, radii], axis=1),
         config.arena.poi_radius,
         _NUM_CANDIDATES,
+        config.arena.poi_half_width,
     )
     is_there = jax.vmap(
         lambda bearing, distance: models.detect(modality, sensor, readings, bearing, distance)
@@ -230,9 +230,9 @@ def _sense(
     candidates = dataclasses.replace(candidates, is_valid=is_valid)
     found = objects.associate(state.slots, candidates, radius)
     slots = objects.with_candidates(state.slots, candidates, found, _DETECTION, _CLUTTER)
-    floor, farthest = state.grid, proposals.reach(sensor, radius)
+    floor, farthest = state.grid, proposals.reach(sensor, config.arena.poi_half_width)
     if sensor.measures_distance:
-        most = jnp.where(sensor.blind > 0, sensor.blind, jnp.inf)
+        most = proposals.max_range(sensor)
         ignored = jnp.concatenate(
             [jnp.where(slots.is_used[:, None], slots.position, jnp.inf), beside]
         )
@@ -243,7 +243,7 @@ def _sense(
         view = jnp.radians(sensor.field_of_view)
         floor = grids.with_view(floor, pose, view, farthest, modality)
     state = dataclasses.replace(state, slots=slots, grid=floor)
-    if sensor.measures_distance or sensor.channels == _RGB:
+    if sensor.measures_distance or sensor.channels == proposals.RGB:
         looked_at = _looks(state, robot) & (jnp.arange(len(slots.is_used)) == _target(state, robot))
         missed = _expected(mission, state, sensor, readings, robot) & ~found.is_seen & ~looked_at
         slots = objects.with_misses(models, slots, missed, _DETECTION)
@@ -298,12 +298,13 @@ def _expected(
     distance = jnp.linalg.norm(positions - pose[None, :2], axis=-1)
     in_view = jnp.abs(bearing) < jnp.radians(sensor.field_of_view / 2 - _RIM)
     in_view &= distance > mission.config.viewpoint.min_distance
-    in_view &= distance < proposals.reach(sensor, radius)
+    in_view &= distance < proposals.reach(sensor, mission.config.arena.poi_half_width)
     if sensor.measures_distance:
         half = jnp.arcsin(jnp.minimum(radius / 2 / jnp.maximum(distance, radius), 1.0))
         aside = bearing[None] + jnp.array([-1.0, 0.0, 1.0])[:, None] * half[None]
         beams = (aside - sensor.angles[0]) / (sensor.angles[1] - sensor.angles[0])
-        ends = readings.at[jnp.round(beams).astype(jnp.int32)].get(mode="fill", fill_value=0.0)
+        beams = jnp.where(beams < -0.5, len(readings), jnp.round(beams)).astype(jnp.int32)
+        ends = readings.at[beams].get(mode="fill", fill_value=0.0)
         in_view &= jnp.all(ends > distance[None] + radius, axis=0)
     return in_view & _in_sight(mission, state, robot)
 

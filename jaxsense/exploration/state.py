@@ -73,7 +73,7 @@ class ExplorationState:
     Attributes:
       grid: floor and walls that robots have seen.
       slots: the map of objects.
-      failures: looks by each modality at each slot that told nothing.
+      failures: looks by each modality at each slot that told nothing, or had no way there.
       failed_from: places of the latest of these, in metres; infinite for none.
     """
 

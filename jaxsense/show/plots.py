@@ -13,6 +13,7 @@ from matplotlib.patches import Ellipse
 from jaxsense.config import Config
 from jaxsense.core.types import Belief, Fusion, Reliability
 from jaxsense.exploration import ExplorationState
+from jaxsense.exploration import slots as objects
 from jaxsense.show.colours import (
     MARKERS,
     SOFT,
@@ -45,7 +46,12 @@ _MOST = 20  # ellipses of a class
 _CLASS_ROW = 0.24  # inches, of a class in the plot of sigma
 _LOOK_ROW = 0.8  # inches, of a look
 _SMOOTHING = 20  # epochs
+_EXPLORED = (
+    "dark grey: unknown; light grey: free, not seen; black: walls as scanned; lines: walls; "
+    "+ points of interest; ellipses: on the map, dotted if in doubt; dots: robots"
+)
 _HEADING = 0.4  # m
+_TRUTH = "#e0218a"
 _LIKELY = 0.9  # probability of a class that has a colour on the map
 _MIN_LOOKS = 20  # in a bin of the calibration
 _REFERENCES = {"optimal": "--", "naive": ":", "random": (0, (1, 4))}
@@ -292,9 +298,8 @@ def _error(value: Number, difference: Number | None) -> list[list[float]] | None
 def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState]) -> Figure:
     """One mission in an unknown place, at four times: what robots know, before what is there.
 
-    Grey is unknown, white is free, black is a wall; light grey is free floor that nothing has seen.
-    Ellipses are 2 sigma of the objects on the map, coloured once a class is likely; crosses are the
-    PoIs, dots the robots, with their headings.
+    Ellipses are a body's radius and 2 sigma of each slot's position, dotted for slots in doubt, and
+    coloured once a class is likely.
     """
     shown = [states[round(i)] for i in np.linspace(0, len(states) - 1, min(4, len(states)))]
     figure = Figure(figsize=(3.4 * len(shown), 3.6), layout="compressed")
@@ -309,18 +314,26 @@ def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState])
         for x, y, yaw, long in layout.walls:
             ends = long * np.array([-1, 1])
             ax.plot(x + ends * np.cos(yaw), y + ends * np.sin(yaw), color=SOFT, linewidth=0.8)
-        ax.plot(*layout.position[layout.present].T, "k+", markersize=5)
+        ax.plot(*layout.position[layout.present].T, "+", color=_TRUTH, markersize=6, zorder=3)
         probabilities = np.asarray(jax.vmap(fusion.class_probabilities)(slots.belief))
+        is_sure = np.asarray(objects.found(slots))
         for slot in np.flatnonzero(slots.is_used):
             width, axes = np.linalg.eigh(slots.covariance[slot])
             best = int(np.argmax(probabilities[slot]))
             is_likely = probabilities[slot, best] > _LIKELY
-            label = config.arena.classes[best]
+            label, style = config.arena.classes[best], "-" if is_sure[slot] else ":"
             colour = class_colour(config.arena, label) if is_likely else SOFT
             turn = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
             size = 2 * config.arena.poi_radius + 4 * np.sqrt(width[::-1])
             ax.add_patch(
-                Ellipse(slots.position[slot], *size, angle=turn, fill=False, edgecolor=colour)
+                Ellipse(
+                    slots.position[slot],
+                    *size,
+                    angle=turn,
+                    fill=False,
+                    edgecolor=colour,
+                    linestyle=style,
+                )
             )
         for (x, y, yaw), modality in zip(state.scene.poses, config.modality_of_robot, strict=True):
             ahead = x + _HEADING * np.cos(yaw), y + _HEADING * np.sin(yaw)
@@ -329,4 +342,5 @@ def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState])
             ax.plot(x, y, "o", color=colour)
         ax.set(xlim=(-half, half), ylim=(-half, half), title=f"{float(state.time):.0f} s")
         ax.set(xticks=[], yticks=[])
+    figure.supxlabel(_EXPLORED, fontsize=8)
     return figure

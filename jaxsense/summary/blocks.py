@@ -280,14 +280,17 @@ class Found(TypedDict):
     confidence: Annotated[float, Metric("confidence", "Mean, of the most likely class.")]
     observations_per_poi: Annotated[float, Metric("looks per PoI", digits=2)]
     mean_time_s: Annotated[float, Metric("mean time [s]", digits=1)]
-    time_over_known: Annotated[float, Metric("time over known", "Known: all places are told.", 2)]
+    known_time_s: Annotated[float, Metric("known places [s]", "If all places are told.", 1)]
+    time_over_known: Annotated[Maybe, Metric("time over known", "Null if these are late.", 2)]
     late: Annotated[float, Metric("late", "Share of missions that the time limit ends.")]
     collisions: Annotated[int, Metric("collisions", "Control periods with contact.", 0)]
     position_error: PositionError
     gospa: Gospa
     existence: Existence
     overflow: Annotated[int, Metric("left out", "Candidates for which the map had no slot.", 0)]
-    found_and_right: Annotated[list[float], Metric("over time", "Found and right, every 10 s.")]
+    found_and_right: Annotated[
+        list[float], Metric("over time", "Found and right, after every 10 s.")
+    ]
     episodes: Annotated[int, Metric("missions", digits=0)]
 
 

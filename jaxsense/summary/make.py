@@ -163,7 +163,8 @@ def found(
     is_used = np.isfinite(metrics["existence"])
     probability, is_object = metrics["existence"][is_used], metrics["is_object"][is_used]
     of_truth = np.where(is_object, probability, 1 - probability)
-    is_found = max(metrics["found"].sum(), 1)
+    is_found, known_s = max(metrics["found"].sum(), 1), known["time_s"]
+    is_late = bool(np.any(known_s >= limit))
     return {
         "found": float(metrics["found"].sum() / number),
         "false": float(metrics["false"].sum() / number),
@@ -172,7 +173,8 @@ def found(
         "confidence": float(metrics["confidence"].sum() / is_found),
         "observations_per_poi": float(metrics["looks"].sum() / number),
         "mean_time_s": float(seconds.mean()),
-        "time_over_known": float(seconds.mean() / known["time_s"].mean()),
+        "known_time_s": float(known_s.mean()),
+        "time_over_known": None if is_late else float(seconds.mean() / known_s.mean()),
         "late": float(np.mean(seconds >= limit)),
         "collisions": int(metrics["collisions"].sum()),
         "position_error": {

@@ -24,7 +24,7 @@ def two_rooms(door=4, seen=False):
     """A wall at x = .075 with a door of some cells at y = 0, all of it known."""
     evidence = jnp.full((40, 40), -1, jnp.int8).at[20].set(1)
     evidence = evidence.at[20, 20 - door // 2 : 20 + door // 2].set(-1)
-    return grids.Grid(evidence, jnp.full((2, 40, 40), seen), SIDE)
+    return grids.Grid(evidence, jnp.full((2, 40, 40), seen), jnp.zeros((2, 40, 40), bool), SIDE)
 
 
 def ranges_at(pose, wall=np.inf):
@@ -133,11 +133,16 @@ def test_frontiers_lie_at_reachable_unseen_floor():
     seen = jnp.ones((2, 40, 40), bool).at[:, 8, 2:20].set(False).at[1, 12:20].set(False)
     grid = two_rooms().replace(seen=seen.at[:, np.r_[5:11, 30:36], 30:36].set(False))
     paths = distances(grid, POSE[:2], NOTHING)
-    found = frontiers(grid, paths)
+    found = frontiers(grid, 1, paths)
     np.testing.assert_array_equal(found.is_valid, [True, True, False, False])
     np.testing.assert_allclose(found.size, [0.81, 0.81, 0, 0], rtol=1e-5)
     np.testing.assert_allclose(found.position[:2], [[-1.8, 1.95], [1.95, 1.95]], atol=0.1)
-    closed = frontiers(grid, distances(two_rooms(door=0), POSE[:2], NOTHING))
+    # What cameras have given up, LiDARs still may explore.
+    given_up = grid.given_up.at[0, 5:11, 30:36].set(True)
+    for modality, number in ((0, 1), (1, 2)):
+        left = frontiers(grid.replace(given_up=given_up), modality, paths)
+        assert left.is_valid.sum() == number
+    closed = frontiers(grid, 1, distances(two_rooms(door=0), POSE[:2], NOTHING))
     np.testing.assert_array_equal(closed.is_valid, [True, False, False, False])
 
 
@@ -146,7 +151,7 @@ def test_many_missions_equal_a_loop():
         grid = scanned(grids.empty(SIDE, 2), pose, ranges_at(POSE, wall=0.05))
         grid = with_view(grid, pose, 1.4, 2.0, 1)
         paths = distances(grid, pose[:2], NOTHING)
-        return grid, paths, way(grid, paths, jnp.zeros(2)), frontiers(grid, paths)
+        return grid, paths, way(grid, paths, jnp.zeros(2)), frontiers(grid, 1, paths)
 
     poses = POSE[None] + jnp.linspace(0, 0.5, 3)[:, None]
     singles = jax.tree.map(lambda *each: jnp.stack(each), *map(mission, poses))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxsense import ConfigError, exploration, load_pretrained, mission
-from jaxsense.exploration import decide, rollout, slots
+from jaxsense.exploration import decide, proposals, rollout, slots
 from jaxsense.mission.roadmap import require_known_places
 
 CONFIG, MODELS = load_pretrained("default")
@@ -162,8 +162,8 @@ def test_bodies_and_unknown_floor_hide_objects(open_floor):
 def test_a_robot_that_does_not_get_nearer_backs_off_and_gives_a_frontier_up(open_floor):
     progressed = jax.jit(rollout._progressed, static_argnums=(0, 2))
     explores = len(open_floor.slots.is_used)  # the first frontier
-    grid = dataclasses.replace(open_floor.grid, seen=jnp.zeros_like(open_floor.grid.seen))
-    late = dataclasses.replace(open_floor, grid=grid, steps=jnp.int32(60)).with_robot(
+    grid = open_floor.grid
+    late = dataclasses.replace(open_floor, steps=jnp.int32(60)).with_robot(
         0,
         target=explores,
         goal=jnp.array([1.5, 1.5, 0.0]),
@@ -175,13 +175,14 @@ def test_a_robot_that_does_not_get_nearer_backs_off_and_gives_a_frontier_up(open
     nearer, stuck = progressed(MISSION, at(0.9), 0), progressed(MISSION, at(0.97), 0)
     assert nearer.robots.left[0] == pytest.approx(0.9)
     assert not nearer.robots.reconsiders[0]
-    assert not jnp.any(nearer.grid.seen)
+    assert not jnp.any(nearer.grid.given_up)
     # 6.0 s without 5 cm of progress.
     assert stuck.robots.reconsiders[0]
     assert stuck.robots.backs_off_until[0] > 6.5
     given_up = np.pi * 0.5**2 / grid.cell**2
-    assert jnp.sum(stuck.grid.seen[0]) == pytest.approx(given_up, rel=0.1)
-    assert not jnp.any(stuck.grid.seen[1])
+    assert jnp.sum(stuck.grid.given_up[0]) == pytest.approx(given_up, rel=0.1)
+    assert not jnp.any(stuck.grid.given_up[1])
+    np.testing.assert_array_equal(stuck.grid.seen, grid.seen)
 
 
 def test_a_viewpoint_out_of_reach_is_one_of_a_failed_look(open_floor):
@@ -194,7 +195,7 @@ def test_a_viewpoint_out_of_reach_is_one_of_a_failed_look(open_floor):
     assert stuck.failures[2, 1] == 1
     assert jnp.sum(stuck.failures) == 1
     np.testing.assert_array_equal(stuck.failed_from[2, 1, 0], goal[:2])
-    assert not jnp.any(stuck.grid.seen != late.grid.seen)
+    assert not jnp.any(stuck.grid.given_up)
 
 
 def test_only_beams_that_pass_its_place_refute_an_object(open_floor):
@@ -207,6 +208,26 @@ def test_only_beams_that_pass_its_place_refute_an_object(open_floor):
     np.testing.assert_array_equal(found[:3], [True, False, True])  # one is hidden
     found = expected(MISSION, state, lidar, at_object, 1)
     np.testing.assert_array_equal(found[:3], [False, False, True])
+    # A wide body at a rim, 0.36 m away, reaches out of the scan by 1.5 degrees, on both sides.
+    wide = mission.make_mission(among_walls(CONFIG, poi_radius=0.15))
+    place = open_floor.slots.position.at[0].set(jnp.array([0.36, 0.0]))
+    slots_there = dataclasses.replace(open_floor.slots, position=place)
+    near = dataclasses.replace(open_floor, slots=slots_there)
+    for sign in (-1, 1):
+        turn = sign * np.radians(lidar.field_of_view / 2 - 10.5)
+        near = stood(near, (-2.0, -2.0, 0.0), (0.0, 0.0, turn))
+        assert not expected(wide, near, lidar, passing, 1)[0]
+
+
+def test_robots_explore_by_what_their_sensors_see_at_once():
+    # 240 degrees up to the 5 m of its range, 80 degrees up to 2 m.
+    lidar, camera = (proposals.reach(MISSION.world.sensors[m], 0.1) for m in (1, 0))
+    assert (lidar, camera) == (5.0, 2.0)
+    shares = decide._shares(MISSION)
+    np.testing.assert_allclose(shares, [80 * 2**2 / (240 * 5**2), 1.0], rtol=2e-3)
+    # Five beams of 240 / 682 degrees on a body of 6 cm.
+    narrow = proposals.reach(MISSION.world.sensors[1], 0.03)
+    assert narrow == pytest.approx(0.06 / (5 * np.radians(240 / 682)), rel=1e-4)
 
 
 def test_places_are_either_known_or_found(begun):
