@@ -17,7 +17,11 @@ from jaxsense.config.mission import CONTROL_PERIOD, LocalisationConfig
 from jaxsense.config.options import Positional
 from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.core.types import Key
+from jaxsense.dqn.agent import Agent
+from jaxsense.dqn.policies import Trained
+from jaxsense.dqn.team import Known
 from jaxsense.exploration import ExplorationState
+from jaxsense.exploration.state import NUM_FRONTIERS, num_slots
 from jaxsense.models import Models
 from jaxsense.run import cli, devices, files, output, rundir
 from jaxsense.run.output import say
@@ -30,7 +34,6 @@ from jaxsense.summary.tables import of_metrics
 
 PROGRAM = "jaxsense.explore"
 _CHUNK = 100  # control periods between two reports
-_KNOWN = "nearest"  # policy of the missions with known places
 _SHOWN = "found", "false", "duplicates", "right", "position_error.median", "mean_time_s"
 
 
@@ -58,7 +61,8 @@ class Arguments(Checked):
         `pretrained:PRESET` for models that ship.
       episodes: Number of missions per policy.
       seed: Seed of the arenas and of all noise, from 0 to 2^32 - 1.
-      policy: `explore_first`, `look_first`, `nearest` or `gain_rate`; or `all`.
+      policy: One of `latent`, `auction`, `nearest`, `gain_rate`, `look_first` and `explore_first`,
+        or `all`.
       robots: Sensors of the robots, one per robot; the run's by default.
       time_limit: Maximum length of a mission, in seconds.
       out: Directory for figures and pictures, new or empty; by default `runs/DATE-TIME-explore`.
@@ -89,8 +93,7 @@ def main(argv: list[str] | None = None) -> None:
         devices.start(1)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained)
-        require_known("policy", arguments.policy, (*exploration.POLICIES, "all"))
-        names = [*exploration.POLICIES] if arguments.policy == "all" else [arguments.policy]
+        names = _policies(arguments.policy, models.agent, config)
         cli.keep_programs(PROGRAM, arguments.cache, config)
         play = Explorations(config, models, arguments.episodes, arguments.seed)
         played = {"run": str(arguments.run), "seed": arguments.seed, "robots": config.carried}
@@ -98,9 +101,13 @@ def main(argv: list[str] | None = None) -> None:
         played |= {"arena": arena, "time_limit": arguments.time_limit}
         with rundir.begun(arguments.out, "explore") as place, Display() as display:
             report = functools.partial(display.show, metrics={})
-            known = play.known(functools.partial(report, "known places"))
+            if "latent" in names:
+                learned = "latent has learned with {} to {} PoIs at known places"
+                learned = learned.format(*config.team.num_pois)
+                cli.warn(PROGRAM, f"{learned}, and chooses among up to {_num_places(config)} now")
             found = dict[str, blocks.Found]()
             for name in names:
+                known = play.known(name, functools.partial(report, f"{name}, known places"))
                 measured, over_time, shown = play.policy(name, functools.partial(report, name))
                 limit = config.mission.time_limit
                 found[name] = make.found(measured, known, over_time, limit)
@@ -136,10 +143,15 @@ class Explorations:
         """The arenas, and what robots know of them."""
         return jax.jit(self._reset)(self._begin_keys)
 
-    def known(self, report: Callable[[int, int], None]) -> Measured:
-        """Metrics of missions whose robots are told all places."""
+    @functools.cached_property
+    def _told(self) -> ExplorationState:
+        """The arenas, and robots that know all places."""
         tell = jax.vmap(lambda state: exploration.told(self._scenario, state))
-        *_, (metrics, _) = self._play(_KNOWN, jax.jit(tell)(self._begun), report)
+        return jax.jit(tell)(self._begun)
+
+    def known(self, name: str, report: Callable[[int, int], None]) -> Measured:
+        """Metrics of a policy whose robots are told all places."""
+        *_, (metrics, _) = self._play(name, self._told, report)
         return metrics
 
     def policy(
@@ -174,12 +186,24 @@ class Explorations:
         """Plays a chunk of all missions with the policy of an index."""
         models = self._models
 
-        def policy(key: Key, models: Models, options: exploration.Options) -> jax.Array:
-            return jax.lax.switch(index, [*exploration.POLICIES.values()], key, models, options)
+        def policy(key: Key, models: Trained, known: Known) -> jax.Array:
+            return jax.lax.switch(index, [*exploration.POLICIES.values()], key, models, known)
 
         keys = jax.random.split(key, len(states.done))
         after = exploration.rollout_batch(keys, self._scenario, models, policy, states, _CHUNK)
         return after, jax.vmap(lambda state: exploration.measure(models, state))(after)
+
+
+def _policies(wanted: str, agent: Agent, config: Config) -> list[str]:
+    """Names of the policies to play; a network for one number of PoIs plays none."""
+    known = [x for x in exploration.POLICIES if x != "latent" or agent.plays(_num_places(config))]
+    require_known("policy", wanted, (*known, "all"))
+    return known if wanted == "all" else [wanted]
+
+
+def _num_places(config: Config) -> int:
+    """Number of objects and frontiers that a robot chooses from."""
+    return num_slots(config) + NUM_FRONTIERS
 
 
 def _elsewhere(arguments: Arguments, config: Config) -> Config:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from smoke import error_line
 
-from jaxsense import exploration, explore, load_pretrained, mission
+from jaxsense import ConfigError, exploration, explore, load_pretrained, mission
+from jaxsense.dqn.agent import Agent
 from jaxsense.exploration.slots import Gospa
 from jaxsense.show import plots
 from jaxsense.summary import make
@@ -74,7 +75,7 @@ def test_the_picture_shows_what_robots_know_before_what_is_there():
 @pytest.mark.parametrize(
     ("argv", "error"),
     [
-        (["--policy", "best"], "policy = 'best': must be one of explore_first"),
+        (["--policy", "best"], "policy = 'best': must be one of latent"),
         (["--episodes", "0"], "episodes = 0: must be a whole number, from 1 to 8,192"),
         (["--arena.fewest-pois", "13"], "arena.fewest_pois = 13"),
         (["--robots", "camera", "camera"], "robots = ('camera', 'camera')"),
@@ -92,6 +93,15 @@ def test_what_cannot_be_explored_is_refused_and_changes_nothing(
     (tmp_path / "full" / "file").write_text("precious")
     assert error in error_line(["--cache", "none", *argv], capsys, explore)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
+
+
+def test_a_network_for_a_fixed_number_of_pois_plays_no_policy():
+    config, models = load_pretrained("default")
+    dense = Agent(0.5, 0.0, None, 3, 2, 2, (4,))
+    assert explore._policies("all", models.agent, config) == [*exploration.POLICIES]
+    assert "latent" not in explore._policies("all", dense, config)
+    with pytest.raises(ConfigError, match="policy = 'latent': must be one of auction"):
+        explore._policies("latent", dense, config)
 
 
 @pytest.mark.slow  # compiles missions

@@ -198,6 +198,11 @@ class ArenaConfig(Section, place="arena"):
                 require(twin == word, self, "classes", expected)
 
     @property
+    def density(self) -> float:
+        """Expected number of PoIs on a square metre."""
+        return (self.num_pois + (self.fewest_pois or self.num_pois)) / 2 / self.side**2
+
+    @property
     def poi_extent(self) -> float:
         """Radius of the circle that holds a PoI of any shape at any yaw, in metres."""
         return math.sqrt(2.0) * self.poi_radius

@@ -73,20 +73,26 @@ class Agent:
         """Values of looks, once the robot has arrived; NOP's last."""
         return networks.apply(self.network, params, observed)
 
-    def values(self, params: Params, observed: Float[Array, "S ..."]) -> Float[Array, "A ..."]:
-        """Values of actions as the robot sets out.
+    def values(
+        self,
+        params: Params,
+        observed: Float[Array, "S ..."],
+        exists: Float[Array, "N ..."] | float = 1.0,
+    ) -> Float[Array, "A ..."]:
+        """Values of actions as the robot sets out, by the probability that there is a PoI.
 
-        With travel `discount^t q - second_cost t`, with `t` the seconds until the look. NOP takes
-        none.
+        With travel `exists discount^t q - second_cost t`, with `t` the seconds until the look. NOP
+        takes none.
         """
         after = self.q(params, observed)
+        of_pois = exists * after[:-1]
         if self.travel is None:
-            return after
+            return jnp.concatenate([of_pois, after[-1:]])
         features = num_features(self.latent_size, self.num_modalities)
         known = observed.reshape(features, -1, *observed.shape[1:])
         seconds = TIME_SCALE * known[2 * self.latent_size]
         discount = jnp.maximum(self.discount**seconds, _LEAST_DISCOUNT)
-        of_pois = discount * after[:-1] - self.second_cost * seconds
+        of_pois = discount * of_pois - self.second_cost * seconds
         return jnp.concatenate([of_pois, after[-1:]])
 
 

@@ -84,7 +84,7 @@ def latent(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
         belief = jax.tree.map(lambda own, x: jnp.where(there, own, x), belief, nearest)
     observed = agent.observe(belief, team, known.times, known.robot)
     # Picked parameters would be one network for each row of a batch.
-    values = [agent.values(params, observed) for params in models.q_networks]
+    values = [agent.values(params, observed, known.exists) for params in models.q_networks]
     return values[0] if len(values) == 1 else jnp.stack(values)[known.modality]
 
 
@@ -94,7 +94,7 @@ def _by_values(read: Callable[..., jax.Array], probabilities: Probabilities) -> 
     def gains(models: Trained, known: Known) -> jax.Array:
         of_pois, is_seen = probabilities(models, known), known.is_seen
         found = [jax.vmap(read, (None, 0, 0))(x, of_pois, is_seen) for x in models.look_values]
-        return jnp.stack(found)[known.team.modality]
+        return jnp.stack(found)[known.team.modality] * jnp.reshape(known.exists, (1, -1))
 
     return gains
 

@@ -86,6 +86,7 @@ class Known:
       log_posterior: `[N, C]` logarithms of the classes' probabilities by exact Bayes.
       team: robots and PoIs at this moment; PoIs that the robot has given up are not present.
       times: `[R, N]` seconds until each robot has looked at each PoI, see `Travel`.
+      exists: `[N]` probability that the PoI exists; below 1 where a robot may find one.
     """
 
     belief: Belief
@@ -94,6 +95,7 @@ class Known:
     team: Team
     times: jax.Array
     robot: jax.Array
+    exists: jax.Array | float = 1.0
 
     @property
     def modality(self) -> jax.Array:

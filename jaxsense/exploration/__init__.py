@@ -7,8 +7,6 @@ otherwise.
 """
 
 from jaxsense.exploration.decide import POLICIES as POLICIES
-from jaxsense.exploration.decide import Options as Options
-from jaxsense.exploration.decide import Policy as Policy
 from jaxsense.exploration.grid import Grid as Grid
 from jaxsense.exploration.outcome import measure as measure
 from jaxsense.exploration.proposals import Candidates as Candidates

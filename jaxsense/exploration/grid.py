@@ -201,10 +201,9 @@ def is_passable(grid: Grid, blocked: Float[Array, "P 3"]) -> Cells:
     Args:
       blocked: x, y and radius of other bodies, in metres, from whose outlines it keeps away, too.
     """
-    to_wall = grid.side / 2 - np.maximum.outer(np.abs(grid.centres), np.abs(grid.centres))
     is_in = _is_in(grid, blocked[:, :2], blocked[:, 2] + PLANNING_RADIUS)
     is_open = grid.free & ~_is_beside(grid.occupied, _SIDES)
-    return is_open & (to_wall >= PLANNING_RADIUS) & ~is_in
+    return is_open & (_to_outer_wall(grid) >= PLANNING_RADIUS) & ~is_in
 
 
 def distances(grid: Grid, start: Place, blocked: Float[Array, "P 3"]) -> Lengths:
@@ -291,10 +290,12 @@ def way(grid: Grid, distances: Lengths, position: Place) -> Place:
     return jnp.where(is_there, ends[last], position)
 
 
-def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> Frontiers:
+def frontiers(
+    grid: Grid, modality: Index, distances: Lengths, number: int, gap: float, ignored: float
+) -> Frontiers:
     """Places next to floor that nobody has seen and this modality has not given up.
 
-    Two by two cells of it must have room.
+    Two by two cells of it must have room for a PoI.
 
     One after the other, the reachable cell in or next to unseen floor with the most of it around,
     where near floor counts more, and no place before it within 1 m. Places with less than .08 m2
@@ -303,11 +304,17 @@ def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> F
     Args:
       distances: of all cells from the robot, in metres, see `distances`.
       number: of places, static.
+      gap: that PoIs keep from inner walls, in metres, and half of it from the outer ones; static.
+      ignored: unseen floor up to which there is no place, in square metres.
     """
-    left_out = jnp.any(grid.seen, axis=0) | grid.given_up[modality] | grid.occupied
-    unseen = _squares(~left_out)
+    near_wall = grid.occupied
+    for _ in range(1, int(gap / grid.cell)):
+        near_wall = _is_beside(near_wall, _AROUND)
+    left_out = jnp.any(grid.seen, axis=0) | grid.given_up[modality] | grid.occupied | near_wall
+    unseen = _squares(~left_out & (_to_outer_wall(grid) > gap / 2))
     reachable = jnp.isfinite(distances)
     cells, area = np.arange(len(distances)), grid.cell**2
+    is_worth = area * jnp.sum(unseen) > ignored
     # Whole numbers, so that equal sums are equal everywhere.
     tent = np.maximum(round(_VIEW / grid.cell) - np.abs(np.subtract.outer(cells, cells)), 0)
     # Where a robot stands it sees at least that cell, or one beside it that it cannot enter.
@@ -320,7 +327,7 @@ def frontiers(grid: Grid, modality: Index, distances: Lengths, number: int) -> F
         x, y, away = grid.offsets(position)
         near = unseen & (away <= _VIEW)
         heading, size = jnp.arctan2(jnp.sum(y * near), jnp.sum(x * near)), jnp.sum(area * near)
-        is_valid = (score[i, j] > 0) & (size >= LEAST_FRONTIER)
+        is_valid = (score[i, j] > 0) & (size >= LEAST_FRONTIER) & is_worth
         distance = jnp.where(is_valid, distances[i, j], jnp.inf)
         left = jnp.where(away < _SPACING, 0.0, score)
         return left, Frontiers(position, heading, size * is_valid, distance, is_valid)
@@ -340,6 +347,11 @@ def _crossed(
     goes_on = jnp.take(ranges, index, mode="clip") > distance[None] + _CROSSED
     is_crossed = jnp.all((index < len(ranges)) & goes_on, axis=0)
     return is_crossed | (distance < grid.cell / 2), distance
+
+
+def _to_outer_wall(grid: Grid) -> Float[np.ndarray, "K K"]:
+    """Distances of all cells from the nearest outer wall, in metres."""
+    return grid.side / 2 - np.maximum.outer(np.abs(grid.centres), np.abs(grid.centres))
 
 
 def _is_in(grid: Grid, centres: Float[Array, "P 2"], radii: Float[Array, " P"]) -> Cells:

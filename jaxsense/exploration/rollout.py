@@ -12,10 +12,10 @@ from mujoco import mjx
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, others, within_a_turn
+from jaxsense.dqn.policies import Values
 from jaxsense.exploration import decide, proposals
 from jaxsense.exploration import grid as grids
 from jaxsense.exploration import slots as objects
-from jaxsense.exploration.decide import Policy
 from jaxsense.exploration.slots import Slots
 from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
 from jaxsense.mission import navigation
@@ -50,7 +50,7 @@ def rollout_batch(
     keys: Key,
     mission: Mission,
     models: Models,
-    policy: Policy,
+    policy: Values,
     states: ExplorationState,
     steps: int,
 ) -> ExplorationState:
@@ -69,7 +69,7 @@ def rollout_batch(
 
 
 def step(
-    keys: Key, mission: Mission, models: Models, policy: Policy, states: ExplorationState
+    keys: Key, mission: Mission, models: Models, policy: Values, states: ExplorationState
 ) -> ExplorationState:
     """Runs one control period of B missions side by side: all robots sense, decide and move."""
     before, num_robots = states, mission.world.arena.num_robots

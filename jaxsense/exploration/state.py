@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsense.config import ConfigError
+from jaxsense.config import Config, ConfigError
 from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.core import checks
 from jaxsense.core.types import Index, Key, pytree
@@ -34,9 +34,9 @@ _TOGETHER = 1.0  # m in x and y, from the first robot to the others
 _NUM_CANDIDATES = 64
 
 
-def num_slots(mission: Mission) -> int:
+def num_slots(config: Config) -> int:
     """S, the size of the map."""
-    return mission.config.arena.num_pois + SPARE_SLOTS
+    return config.arena.num_pois + SPARE_SLOTS
 
 
 @pytree
@@ -118,14 +118,15 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
     layout = arenas.random_layout(layout_key, config.arena, classes)
     poses = _random_poses(pose_key, mission, layout)
     grid = grids.empty(config.arena.side, len(config.modalities))
-    nothing, size = num_slots(mission) + NUM_FRONTIERS, (num_slots(mission), len(config.modalities))
+    size = num_slots(config), len(config.modalities)
+    nothing = size[0] + NUM_FRONTIERS
     return ExplorationState(
         scene=Scene(layout, random_light(light_key, mission.world.reads_conditions), poses),
         classes=classes,
         velocity=jnp.zeros((num_robots, 3)),
         warmstart=jnp.zeros(3 * num_robots),
         grid=grid,
-        slots=objects.empty(models, num_slots(mission)),
+        slots=objects.empty(models, size[0]),
         failures=jnp.zeros(size, jnp.int32),
         failed_from=jnp.full((*size, ATTEMPTS, 2), jnp.inf),
         robots=Explorers(

@@ -92,7 +92,7 @@ def test_random_takes_every_action_equally_often():
 
 
 def test_latent_takes_the_action_that_the_own_q_network_values_most(monkeypatch):
-    monkeypatch.setattr(Agent, "values", lambda agent, params, observed: params)
+    monkeypatch.setattr(Agent, "values", lambda agent, params, observed, exists: params)
     agent, classes = Agent(0.5, 0.0, None, 3, 2, 2, (4,)), Belief(*jnp.ones((2, 5, 2)))
     models = {"agent": agent, "fusion": SimpleNamespace(classes=classes)}
     for best in range(4):
@@ -106,7 +106,7 @@ def test_latent_takes_the_action_that_the_own_q_network_values_most(monkeypatch)
 
 def test_a_dense_network_is_shown_a_poi_that_was_given_up_as_of_the_nearest_class(monkeypatch):
     agent = Agent(0.5, 0.0, None, 3, 2, 1, (4,))
-    monkeypatch.setattr(Agent, "values", lambda agent, params, observed: observed)
+    monkeypatch.setattr(Agent, "values", lambda agent, params, observed, exists: observed)
     classes = Belief(jnp.array([[0.0], [4.0]]), jnp.array([[0.25], [0.75]]))
     belief = Belief(jnp.array([[1.0], [3.0], [5.0]]), jnp.array([[2.0], [4.0], [8.0]]))
     known = known_of(UNKNOWN, np.zeros((3, 2)), belief=belief)

@@ -55,6 +55,9 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     agent = Agent(0.5, 0.1, TRAVEL, 3, 1, 1, (8,))
     # 2 s: 8/4 - .2; at once; 4 s: 16/16 - .4; NOP.
     np.testing.assert_allclose(agent.values(after, seen), [1.8, 3.0, 0.6, 0.0], rtol=1e-6)
+    # By half and by a quarter there is no PoI, and the way there costs the same.
+    doubtful = agent.values(after, seen, jnp.array([0.5, 0.25, 1.0]))
+    np.testing.assert_allclose(doubtful, [0.8, 0.75, 0.6, 0.0], rtol=1e-6)
     # The same for a batch in the last axis.
     both = agent.values(jnp.stack([after, -after], 1), jnp.stack([seen, seen], 1))
     np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)

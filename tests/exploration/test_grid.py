@@ -12,7 +12,7 @@ SIDE = 6.0  # 40 cells of .15 m
 NOTHING, POSE = jnp.zeros((0, 3)), jnp.array([-1.5, 0.0, 0.0])
 ANGLES = np.linspace(-np.pi, np.pi, 720, endpoint=False)
 distances, way, with_view = map(jax.jit, (grids.distances, grids.way, grids.with_view))
-frontiers = jax.jit(functools.partial(grids.frontiers, number=4))
+frontiers = jax.jit(functools.partial(grids.frontiers, number=4, gap=0.1, ignored=0.0))
 
 
 @jax.jit

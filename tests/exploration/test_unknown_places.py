@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from jaxsense import ConfigError, exploration, load_pretrained, mission
 from jaxsense.exploration import decide, proposals, rollout, slots
@@ -32,6 +33,15 @@ def begun():
 @pytest.fixture(scope="module")
 def told(begun):
     return exploration.told(MISSION, begun)
+
+
+@pytest.fixture(scope="module")
+def scanned(begun):
+    """After three scans of each robot."""
+    sense = jax.jit(rollout.sense, static_argnums=1)
+    for seed in range(1, 4):
+        begun = sense(jax.random.key(seed), MISSION, MODELS, begun)
+    return begun
 
 
 def test_robots_start_apart_from_everything_on_an_empty_map(begun):
@@ -62,58 +72,111 @@ def options(state):
 
 
 def test_a_robot_that_knows_all_may_look_at_each_poi_and_explores_nothing(told):
-    found, number = options(told), len(told.slots.existence)
+    (known, goals), number = options(told), len(told.slots.existence)
     present = jnp.pad(told.scene.layout.present, (0, 4))
-    np.testing.assert_array_equal(found.is_possible[:number], present)
-    assert not jnp.any(found.is_possible[number:])
+    np.testing.assert_array_equal(known.team.present[:number], present)
+    assert not jnp.any(known.team.present[number:])
     for slot in np.flatnonzero(present):
-        to_poi = told.slots.position[slot] - found.goal[slot, :2]
+        to_poi = told.slots.position[slot] - goals[slot, :2]
         distance = float(jnp.linalg.norm(to_poi))
         assert HIDDEN.viewpoint.min_distance <= distance <= HIDDEN.navigation.view_range + 1e-5
-        assert jnp.arctan2(to_poi[1], to_poi[0]) == pytest.approx(float(found.goal[slot, 2]))
+        assert jnp.arctan2(to_poi[1], to_poi[0]) == pytest.approx(float(goals[slot, 2]))
         # As fast as a robot drives, no path is shorter than the straight line.
-        straight = jnp.linalg.norm(found.goal[slot, :2] - told.scene.poses[0, :2])
-        assert found.seconds[slot] >= 5 * straight
-    # Both robots carry other sensors, so neither takes anything away from the other.
-    assert not jnp.any(found.is_taken)
+        straight = jnp.linalg.norm(goals[slot, :2] - told.scene.poses[0, :2])
+        assert known.times[0, slot] >= 5 * straight
+    np.testing.assert_array_equal(known.exists[:number], 1)
+    # The other robot has yet to choose, and heads for nothing.
+    assert not jnp.any(known.team.heads)
+
+
+def pays(state, slot):
+    known = options(state)[0]
+    return exploration.POLICIES["nearest"](jax.random.key(0), MODELS, known)[slot] > 0
 
 
 def test_looks_that_failed_or_tell_nothing_are_not_worth_going_for(told):
     slot = int(jnp.argmax(told.scene.layout.present))
     failed = dataclasses.replace(told, failures=told.failures.at[slot].set(3))
-    assert options(told).gain[slot] > 0
-    assert options(failed).gain[slot] == 0
+    assert pays(told, slot)
+    assert not options(failed)[0].team.present[slot]
     classes = MODELS.fusion.classes
     belief = jax.tree.map(lambda rows, x: rows.at[slot].set(x[0]), told.slots.belief, classes)
     seen = told.slots.times_seen.at[slot].set(1)
     certain = dataclasses.replace(told.slots, belief=belief, times_seen=seen)
-    assert options(dataclasses.replace(told, slots=certain)).gain[slot] <= 0
+    assert not pays(dataclasses.replace(told, slots=certain), slot)
 
 
-def test_rules_choose_by_hand_worked_numbers():
-    # A look worth .5 nats 9 s away, a frontier of 1 m2 4 s away, another of 8 m2 19 s away.
-    chosen = exploration.Options(
-        gain=jnp.array([0.5, 1.0, 8.0, 9.0]),
-        seconds=jnp.array([9.0, 4.0, 19.0, 1.0]),
-        goal=jnp.zeros((4, 3)),
-        is_possible=jnp.array([True, True, True, False]),
-        is_taken=jnp.zeros(4, bool),
-        is_look=jnp.array([True, False, False, False]),
+def test_frontiers_are_pois_that_may_be_there_and_another_robot_heads_for(scanned):
+    number, arena = len(scanned.slots.existence), HIDDEN.arena
+    known, goals = options(scanned)
+    first = number + int(jnp.argmax(known.team.present[number:]))
+    # Three to five PoIs on 25 m2; a camera sees less at once than a LiDAR.
+    assert arena.density == pytest.approx(4 / 25)
+    assert 0 < known.exists[first] < -jnp.expm1(-arena.density * jnp.pi * 0.75**2)
+    np.testing.assert_array_equal(known.belief.std[first], MODELS.fusion.prior.std)
+    beside = goals[first] + jnp.array([0.5, 0.0, 0.0])
+    headed = scanned.with_robot(1, target=jnp.int32(number), goal=beside)
+    assert options(headed)[0].team.target[1] == first
+    away = headed.with_robot(1, goal=goals[first] + jnp.array([9.0, 0.0, 0.0]))
+    assert options(away)[0].team.target[1] == NOTHING
+
+
+def test_rules_choose_by_hand_worked_numbers(told):
+    # A look after 9 s; frontiers after 10, 19 and 1 s, where a PoI is by chance .1, .4 and .9.
+    known, place = options(told)[0], jnp.arange(NOTHING)
+    chosen = dataclasses.replace(
+        known,
+        belief=jax.tree.map(lambda x: jnp.tile(x, (NOTHING, 1)), MODELS.fusion.prior),
+        team=dataclasses.replace(known.team, present=place < 3, works=jnp.ones(2, bool)),
+        times=jnp.zeros((2, NOTHING)).at[:, :4].set(jnp.array([9.0, 10.0, 19.0, 1.0])),
+        exists=jnp.ones(NOTHING).at[1:4].set(jnp.array([0.1, 0.4, 0.9])),
     )
-    key, taken = jax.random.key(0), dataclasses.replace(chosen, is_taken=jnp.arange(4) == 1)
-    best = {n: int(jnp.argmax(f(key, MODELS, chosen))) for n, f in exploration.POLICIES.items()}
-    # A second: 1 / 9, 1 / 4 and 8 ** 0.5 / 19, and then 25 ** 0.5 / 19.
-    assert best == {"explore_first": 1, "look_first": 0, "nearest": 1, "gain_rate": 1}
-    large = dataclasses.replace(chosen, gain=jnp.array([0.5, 1.0, 25.0, 9.0]))
-    assert jnp.argmax(exploration.POLICIES["gain_rate"](key, MODELS, large)) == 2
-    assert jnp.argmax(exploration.POLICIES["nearest"](key, MODELS, taken)) == 0
-    nothing = dataclasses.replace(chosen, is_possible=jnp.zeros(4, bool))
-    for policy in exploration.POLICIES.values():
-        assert jnp.argmax(policy(key, MODELS, nothing)) == 4
+
+    def of(name, known):
+        values = exploration.POLICIES[name](jax.random.key(0), MODELS, known)
+        return int(decide.action_of(values, known))
+
+    rules = [name for name in exploration.POLICIES if name != "latent"]
+    # A second: 1 / 9, 6 * .1 ** .5 / 10 = .19 and 6 * .4 ** .5 / 19 = .2.
+    expected = {"explore_first": 1, "look_first": 0, "nearest": 0, "auction": 0, "gain_rate": 2}
+    assert {name: of(name, chosen) for name in rules} == expected
+    likely = dataclasses.replace(chosen, exists=chosen.exists.at[1].set(0.2))
+    assert of("gain_rate", likely) == 1
+
+    def taken(poi):
+        team = dataclasses.replace(chosen.team, target=jnp.array([NOTHING, poi]))
+        return dataclasses.replace(chosen, team=team)
+
+    assert (of("nearest", taken(0)), of("gain_rate", taken(2))) == (1, 1)
+    # The other robot carries another sensor, so it takes no look away.
+    near = dataclasses.replace(taken(0), times=chosen.times.at[:, 0].set(1.0))
+    assert of("gain_rate", near) == 0
+    nothing = dataclasses.replace(
+        chosen, team=dataclasses.replace(chosen.team, present=jnp.zeros(NOTHING, bool))
+    )
+    assert {of(name, nothing) for name in exploration.POLICIES} == {NOTHING}
 
 
-def test_one_scan_shows_floor_and_the_pois_in_view(begun):
-    after = jax.jit(rollout.sense, static_argnums=1)(jax.random.key(1), MISSION, MODELS, begun)
+def test_the_network_alone_chooses_looks_and_frontiers(scanned):
+    """Other parameters, other choices: the network's highest value among those that exist."""
+    (known, _), choices = options(scanned), []
+    for seed in range(8):
+        flat, of_flat = ravel_pytree(MODELS.q_networks)
+        params = of_flat(jax.random.normal(jax.random.key(seed), flat.shape))
+        models = dataclasses.replace(MODELS, q_networks=params)
+        policy = exploration.POLICIES["latent"]
+        chosen = decide.choose(jax.random.key(0), MISSION, models, policy, scanned, 0)
+        agent, present = models.agent, np.append(known.team.present, True)
+        observed = agent.observe(known.belief, known.team, known.times, known.robot)
+        of_pois = agent.values(params[int(known.modality) * (len(params) > 1)], observed)
+        values = np.append(known.exists * of_pois[:-1], 0.0)
+        choices.append(int(chosen.robots.target[0]))
+        assert choices[-1] == np.argmax(np.where(present, values, -np.inf))
+    assert len({*choices}) > 1
+
+
+def test_scans_show_floor_and_the_pois_in_view(begun, scanned):
+    after = scanned
     assert jnp.sum(after.grid.free) > 100
     used = np.flatnonzero(after.slots.is_used)
     places = np.asarray(begun.scene.layout.position)
