@@ -53,6 +53,18 @@ class PlaceArguments(Checked, place="arena"):
     inner_walls: int = 5
 
 
+class PoseArguments(Checked, place="localisation"):
+    """How well robots know their poses.
+
+    Attributes:
+      error: Standard deviations of a robot's constant error, in metres and degrees.
+      drift: Standard deviations of what a metre of driving adds, in metres and degrees.
+    """
+
+    error: tuple[float, float] = (0.0, 0.0)
+    drift: tuple[float, float] = (0.0, 0.0)
+
+
 class Arguments(Checked):
     """Plays missions in which robots find points of interest and walls, and compares policies.
 
@@ -75,6 +87,7 @@ class Arguments(Checked):
     seed: int = limited(0, at_least=0, at_most=MAX_SEED)
     policy: str = "all"
     arena: PlaceArguments = PlaceArguments()
+    localisation: PoseArguments = PoseArguments()
     robots: tuple[str, ...] | None = None
     time_limit: float = limited(600.0, at_least=CONTROL_PERIOD, at_most=3600)
     out: Path | None = None
@@ -98,7 +111,8 @@ def main(argv: list[str] | None = None) -> None:
         play = Explorations(config, models, arguments.episodes, arguments.seed)
         played = {"run": str(arguments.run), "seed": arguments.seed, "robots": config.carried}
         arena = {name: getattr(config.arena, name) for name in vars(arguments.arena)}
-        played |= {"arena": arena, "time_limit": arguments.time_limit}
+        errors = vars(arguments.localisation)
+        played |= {"arena": arena, "localisation": errors, "time_limit": arguments.time_limit}
         with rundir.begun(arguments.out, "explore") as place, Display() as display:
             report = functools.partial(display.show, metrics={})
             if "latent" in names:
@@ -210,12 +224,15 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
     """The run's settings with the places and the team of these missions."""
     fewest = arguments.arena.fewest_pois or min(4, arguments.arena.num_pois)
     places = {**vars(arguments.arena), "fewest_pois": fewest}
-    if config.mission.localisation != LocalisationConfig() or config.mission.communication.own_maps:
-        cli.warn(PROGRAM, "robots know their poses and share one map, other than in the run")
+    if config.mission.communication.own_maps:
+        cli.warn(PROGRAM, "robots share one map, other than in the run")
+    poses = LocalisationConfig(**vars(arguments.localisation))
     return dataclasses.replace(
         config,
         arena=dataclasses.replace(config.arena, **places),
-        mission=dataclasses.replace(config.mission, time_limit=arguments.time_limit),
+        mission=dataclasses.replace(
+            config.mission, time_limit=arguments.time_limit, localisation=poses
+        ),
         mdp=dataclasses.replace(config.mdp, partly_seen_starts=False),
         robots=config.robots if arguments.robots is None else arguments.robots,
     )

@@ -107,10 +107,12 @@ def test_a_network_for_a_fixed_number_of_pois_plays_no_policy():
 @pytest.mark.slow  # compiles missions
 def test_missions_end_in_figures_and_pictures(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    explore.main([*SMALL, "--episodes", "2", "--time-limit", "150", "--out", "here"])
+    errs = ["--localisation.error", ".01", "1"]
+    explore.main([*SMALL, *errs, "--episodes", "2", "--time-limit", "150", "--out", "here"])
     content = json.loads((tmp_path / "here" / "found.json").read_text())
     found, arena = content["found"], content["arena"]
     assert content["robots"] == ["camera", "lidar"]
+    assert content["localisation"] == {"error": [0.01, 1.0], "drift": [0.0, 0.0]}
     assert arena == {"side": 4.0, "num_pois": 3, "fewest_pois": 3, "inner_walls": 5}
     assert [*found] == [*exploration.POLICIES]
     for name, block in found.items():

@@ -90,9 +90,9 @@ def choose(
     target = action_of(policy(key, models, known), known)
     nothing = len(goals)
     goal = goals[jnp.minimum(target, nothing - 1)]
-    goal = jnp.where(target == nothing, state.scene.poses[robot], goal)
+    goal = jnp.where(target == nothing, state.believed_poses[robot], goal)
     way = grids.distances(state.grid, goal[:2], blocked(mission, state, robot))
-    length = lengths_at(state.grid, way, state.scene.poses[robot, None, :2])[0]
+    length = lengths_at(state.grid, way, state.believed_poses[robot, None, :2])[0]
     left = jnp.where(jnp.isfinite(length), length, 0.0)
     is_same = jnp.linalg.norm(goal[:2] - state.robots.goal[robot, :2]) < _SAME_GOAL
     return state.with_robot(
@@ -115,7 +115,7 @@ def options_of(
       What the robot knows of them, for policies: a frontier is a PoI that may be there, at which
       nobody has looked. And their goals: x [m], y [m] and yaw [rad].
     """
-    pose, modality = state.scene.poses[robot], mission.modalities[robot]
+    pose, modality = state.believed_poses[robot], mission.modalities[robot]
     lengths = grids.distances(state.grid, pose[:2], blocked(mission, state, robot))
     arena = mission.config.arena
     frontiers = grids.frontiers(
@@ -137,7 +137,7 @@ def options_of(
     team = Team(
         positions=jnp.concatenate([slots.position, frontiers.position]),
         present=jnp.append(is_open, frontiers.is_valid) & jnp.isfinite(length),
-        poses=state.scene.poses,
+        poses=state.believed_poses,
         modality=mission.modalities,
         works=(robots.target < len(place)) | (jnp.arange(len(robots.target)) == robot),
         target=jnp.where(explores, beside, robots.target),
@@ -177,7 +177,7 @@ def blocked(mission: Mission, state: ExplorationState, robot: Index) -> Float[Ar
     """Circles that no path may cross: x, y and radius of slots and of robots that stand."""
     arena, slots = mission.config.arena, state.slots
     speeds = others(state.robots.command, robot)[:, 0]
-    places = others(state.scene.poses[:, :2], robot)
+    places = others(state.believed_poses[:, :2], robot)
     places = jnp.where((jnp.abs(speeds) < _STANDS)[:, None], places, jnp.inf)
     objects = jnp.where(slots.is_used[:, None], slots.position, jnp.inf)
     radii = jnp.append(
@@ -195,7 +195,7 @@ def _views(
 ) -> tuple[Float[Array, "S 2"], Float[Array, " S"]]:
     """Nearest place to look at each slot from where a look is new, and metres to it."""
     config, modality = mission.config, mission.modalities[robot]
-    slots, position = state.slots, state.scene.poses[robot, :2]
+    slots, position = state.slots, state.believed_poses[robot, :2]
     sides = 2 * jnp.pi * jnp.arange(float(_VIEW_SIDES)) / _VIEW_SIDES
     ring = jnp.stack([jnp.cos(sides), jnp.sin(sides)], axis=-1)
     near = config.viewpoint.min_distance + PLANNING_RADIUS

@@ -16,15 +16,16 @@ from jaxsense.dqn.policies import Values
 from jaxsense.exploration import decide, proposals
 from jaxsense.exploration import grid as grids
 from jaxsense.exploration import slots as objects
-from jaxsense.exploration.slots import Slots
+from jaxsense.exploration.proposals import Candidates
+from jaxsense.exploration.slots import Association, Slots
 from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
 from jaxsense.mission import navigation
 from jaxsense.mission.act import STUCK_TIME, where_due
 from jaxsense.mission.decide import RECOVERY_TIME
-from jaxsense.mission.rollout import move
+from jaxsense.mission.rollout import drifted, move
 from jaxsense.mission.state import RECENT_LOOKS, Mission
 from jaxsense.models import Models
-from jaxsense.sim import amiro, viewpoints
+from jaxsense.sim import amiro, localisation, viewpoints
 from jaxsense.sim import arena as arenas
 from jaxsense.sim import sensors as scanners
 
@@ -73,7 +74,8 @@ def step(
 ) -> ExplorationState:
     """Runs one control period of B missions side by side: all robots sense, decide and move."""
     before, num_robots = states, mission.world.arena.num_robots
-    sense_keys, choice_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    split = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)
+    sense_keys, choice_keys, drift_keys = split(keys)
 
     def sensed(rows: tuple[Key, ExplorationState], _) -> ExplorationState:
         return jax.vmap(lambda key, state: sense(key, mission, models, state))(*rows)
@@ -97,7 +99,7 @@ def step(
     states, _ = jax.lax.scan(decided, states, all_robots)
     steer_each = jax.vmap(functools.partial(steer, mission), (None, 0))
     wanted = jax.vmap(steer_each, (0, None))(states, all_robots)
-    states = move(mission, states, wanted)
+    states = drifted(drift_keys, mission, before, move(mission, states, wanted))
     is_idle = states.robots.target == before.slots.is_used.shape[1] + NUM_FRONTIERS
     since = states.time[:, None] - states.robots.progress_at
     is_over = jnp.all(is_idle & (since > _IDLE_TIME), axis=-1)
@@ -113,8 +115,7 @@ def steer(mission: Mission, state: ExplorationState, robot: Index) -> Float[Arra
 
     Its proximity sensors show what is near.
     """
-    poses, robots = state.scene.poses, state.robots
-    pose = poses[robot]
+    poses, robots, pose = state.scene.poses, state.robots, state.believed_poses[robot]
     goal, backs_off = robots.goal[robot], state.time < robots.backs_off_until[robot]
     waypoint = grids.way(state.grid, robots.way[robot], pose[:2])
     drive = navigation.drive_to(
@@ -123,7 +124,7 @@ def steer(mission: Mission, state: ExplorationState, robot: Index) -> Float[Arra
         poses,
         robots.command,
         robot,
-        waypoint,
+        localisation.aimed_at(waypoint, poses[robot], state.pose_error[robot]),
         CONTROL_PERIOD,
         backs_off,
     )
@@ -133,7 +134,7 @@ def steer(mission: Mission, state: ExplorationState, robot: Index) -> Float[Arra
 
 def _is_there(state: ExplorationState, robot: Index) -> Bool[Array, ""]:
     """Whether a robot has arrived at its goal."""
-    way = state.robots.goal[robot, :2] - state.scene.poses[robot, :2]
+    way = state.robots.goal[robot, :2] - state.believed_poses[robot, :2]
     return jnp.linalg.norm(way) < _AT_GOAL
 
 
@@ -144,7 +145,7 @@ def _progressed(mission: Mission, state: ExplorationState, robot: Index) -> Expl
     viewpoint that it has not reached is one of a failed look. Floor at a frontier that it has still
     not seen, or not reached, is given up.
     """
-    robots, pose = state.robots, state.scene.poses[robot]
+    robots, pose = state.robots, state.believed_poses[robot]
     left = decide.lengths_at(state.grid, robots.way[robot], pose[None, :2])[0]
     off = jnp.abs(within_a_turn(robots.goal[robot, 2] - pose[2]))
     there = _is_there(state, robot)
@@ -193,7 +194,7 @@ def _sense(
 ) -> ExplorationState:
     """Scans with one robot; index and modality are static."""
     config, scene, sensor = mission.config, state.scene, mission.world.sensors[modality]
-    pose, arena = scene.poses[robot], mission.world.arena
+    pose, arena = state.believed_poses[robot], mission.world.arena
     seconds = state.steps * CONTROL_PERIOD
     readings = scanners.scan(
         key,
@@ -206,8 +207,11 @@ def _sense(
         sensor.directions,
         seconds=seconds,
     )
-    beside = others(scene.poses[:, :2], robot)
-    radii = jnp.full((len(beside), 1), 2 * amiro.BODY_RADIUS)
+    beside = others(state.believed_poses[:, :2], robot)
+    driven = state.time * amiro.MAX_SPEED
+    spread = functools.partial(localisation.variance, config.mission.localisation, driven)
+    far = jnp.linalg.norm(beside - pose[None, :2], axis=-1)
+    radii = 2 * amiro.BODY_RADIUS + 2 * jnp.sqrt(spread(far))[:, None]
     candidates = proposals.propose(
         sensor,
         readings,
@@ -227,7 +231,9 @@ def _sense(
     reach, radius = config.arena.side / 2, config.arena.poi_radius
     is_inside = jnp.max(jnp.abs(candidates.position), axis=-1) < reach - radius
     is_valid = candidates.is_valid & is_inside & (is_there | ~in_range)
-    candidates = dataclasses.replace(candidates, is_valid=is_valid)
+    doubt = spread(candidates.distance)[:, None, None] * jnp.eye(2)[None]
+    covariance = candidates.covariance + doubt
+    candidates = dataclasses.replace(candidates, is_valid=is_valid, covariance=covariance)
     found = objects.associate(state.slots, candidates, radius)
     slots = objects.with_candidates(state.slots, candidates, found, _DETECTION, _CLUTTER)
     floor, farthest = state.grid, proposals.reach(sensor, config.arena.poi_half_width)
@@ -248,7 +254,7 @@ def _sense(
         missed = _expected(mission, state, sensor, readings, robot) & ~found.is_seen & ~looked_at
         slots = objects.with_misses(models, slots, missed, _DETECTION)
         state = dataclasses.replace(state, slots=objects.merged(models, slots, radius))
-    return _look(mission, models, state, readings, robot, modality)
+    return _look(mission, models, state, readings, candidates, found, robot, modality)
 
 
 def outer_walls(side: float) -> Float[Array, "4 4"]:
@@ -259,9 +265,9 @@ def outer_walls(side: float) -> Float[Array, "4 4"]:
 
 def _in_sight(mission: Mission, state: ExplorationState, robot: int) -> Bool[Array, " S"]:
     """Slots whose objects nothing hides from a robot: over known floor, behind no nearer body."""
-    pose, positions, arena = state.scene.poses[robot], state.slots.position, mission.config.arena
+    pose, positions, arena = state.believed_poses[robot], state.slots.position, mission.config.arena
     bodies = jnp.where(state.slots.is_used[:, None], positions, jnp.inf)
-    bodies = jnp.concatenate([bodies, others(state.scene.poses[:, :2], robot)])
+    bodies = jnp.concatenate([bodies, others(state.believed_poses[:, :2], robot)])
     number = len(positions)
     radius = jnp.where(jnp.arange(len(bodies)) < number, arena.poi_extent, amiro.BODY_RADIUS)
     way = bodies - pose[None, :2]
@@ -293,7 +299,7 @@ def _expected(
     another one, or a wall, may be no candidate.
     """
     radius = mission.config.arena.poi_radius
-    pose, positions = state.scene.poses[robot], state.slots.position
+    pose, positions = state.believed_poses[robot], state.slots.position
     bearing = jax.vmap(viewpoints.bearing, (None, 0))(pose, positions)
     distance = jnp.linalg.norm(positions - pose[None, :2], axis=-1)
     in_view = jnp.abs(bearing) < jnp.radians(sensor.field_of_view / 2 - _RIM)
@@ -316,7 +322,7 @@ def _target(state: ExplorationState, robot: Index) -> Int[Array, ""]:
 
 def _looks(state: ExplorationState, robot: int) -> Bool[Array, ""]:
     """Whether a robot has arrived at its viewpoint, and turned to its target."""
-    target, pose = _target(state, robot), state.scene.poses[robot]
+    target, pose = _target(state, robot), state.believed_poses[robot]
     bearing = viewpoints.bearing(pose, state.slots.position[target])
     is_slot = (state.robots.target[robot] < len(state.slots.is_used)) & state.slots.is_used[target]
     return is_slot & _is_there(state, robot) & (jnp.abs(bearing) < jnp.radians(_FACING))
@@ -327,14 +333,24 @@ def _look(
     models: Models,
     state: ExplorationState,
     readings: Float[Array, "B *channels"],
+    candidates: Candidates,
+    found: Association,
     robot: int,
     modality: int,
 ) -> ExplorationState:
-    """Updates the belief of the robot's target, if it looks at it, with what its scan says."""
+    """Updates the belief of the robot's target, if it looks at it, with what its scan says.
+
+    It looks where the scan shows the target, which a wrong pose does not change.
+    """
     slots, target, looks = state.slots, _target(state, robot), _looks(state, robot)
-    pose, centre = state.scene.poses[robot], slots.position[target]
+    pose, centre = state.believed_poses[robot], slots.position[target]
     bearing, distance = viewpoints.bearing(pose, centre), jnp.linalg.norm(centre - pose[:2])
-    sensor = mission.world.sensors[modality]
+    sensor, candidate = mission.world.sensors[modality], found.candidate[target]
+    is_shown = candidate < len(candidates.is_valid)
+    bearing = jnp.where(is_shown, candidates.bearing.at[candidate].get(mode="clip"), bearing)
+    if sensor.measures_distance:
+        shown = candidates.distance.at[candidate].get(mode="clip")
+        distance = jnp.where(is_shown, shown, distance)
     detection = models.detect(modality, sensor, readings, bearing, distance)
     sees = looks & decide.can_look(mission, state, pose[:2], centre)
     sees &= _in_sight(mission, state, robot)[target]

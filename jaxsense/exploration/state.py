@@ -17,7 +17,7 @@ from jaxsense.exploration.slots import Slots
 from jaxsense.mission.navigation import clearance
 from jaxsense.mission.state import ATTEMPTS, Mission
 from jaxsense.models import Models
-from jaxsense.sim import amiro
+from jaxsense.sim import amiro, localisation
 from jaxsense.sim import arena as arenas
 from jaxsense.sim.light import random_light
 from jaxsense.sim.world import Scene
@@ -75,6 +75,7 @@ class ExplorationState:
       slots: the map of objects.
       failures: looks by each modality at each slot that told nothing, or had no way there.
       failed_from: places of the latest of these, in metres; infinite for none.
+      pose_error: see `sim.localisation`.
     """
 
     scene: Scene
@@ -85,6 +86,7 @@ class ExplorationState:
     slots: Slots
     failures: Int[Array, "S M"]
     failed_from: Float[Array, "S M A 2"]
+    pose_error: Float[Array, "R 3"]
     robots: Explorers
     steps: Int[Array, ""]
     contacts: Int[Array, ""]
@@ -94,6 +96,11 @@ class ExplorationState:
     def time(self) -> Float[Array, "..."]:
         """Seconds since the start."""
         return self.steps * CONTROL_PERIOD
+
+    @property
+    def believed_poses(self) -> Float[Array, "*B R 3"]:
+        """Poses that robots believe they have: x [m], y [m] and yaw [rad]."""
+        return self.scene.poses + self.pose_error
 
     def with_robot(self, robot: Index, **changes: jax.Array) -> "ExplorationState":
         """Changes one robot."""
@@ -112,11 +119,12 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
     if not any(mission.world.sensors[m].measures_distance for m in config.modality_of_robot):
         expected = "must include one whose sensor measures distances: it shows floor and walls"
         raise ConfigError("robots", config.carried, expected)
-    class_key, layout_key, light_key, pose_key = jax.random.split(key, 4)
+    class_key, layout_key, light_key, pose_key, error_key = jax.random.split(key, 5)
     num_pois = config.arena.num_pois
     classes = jax.random.randint(class_key, (num_pois,), 0, len(config.arena.classes))
     layout = arenas.random_layout(layout_key, config.arena, classes)
     poses = _random_poses(pose_key, mission, layout)
+    error = localisation.draw(error_key, config.mission.localisation, num_robots)
     grid = grids.empty(config.arena.side, len(config.modalities))
     size = num_slots(config), len(config.modalities)
     nothing = size[0] + NUM_FRONTIERS
@@ -129,10 +137,11 @@ def reset(key: Key, mission: Mission, models: Models) -> ExplorationState:
         slots=objects.empty(models, size[0]),
         failures=jnp.zeros(size, jnp.int32),
         failed_from=jnp.full((*size, ATTEMPTS, 2), jnp.inf),
+        pose_error=error,
         robots=Explorers(
             command=jnp.zeros((num_robots, 2)),
             target=jnp.full(num_robots, nothing, jnp.int32),
-            goal=poses,
+            goal=poses + error,
             way=jnp.zeros((num_robots, *grid.evidence.shape)),
             left=jnp.zeros(num_robots),
             progress_at=jnp.zeros(num_robots),

@@ -96,7 +96,7 @@ def step(
     # All robots at once: nothing that they do here changes where the others are.
     steer = jax.vmap(functools.partial(act.steer, mission), (None, 0, 0))
     wanted = jax.vmap(steer, (0, None, 1))(states, all_robots, courses)
-    states = _drift(drift_keys, mission, before, move(mission, states, wanted))
+    states = drifted(drift_keys, mission, before, move(mission, states, wanted))
     is_idle, steps = jnp.all(states.robots.phase >= ENDED, axis=-1), states.steps + 1
     is_late = steps * CONTROL_PERIOD >= mission.config.mission.time_limit
     after = dataclasses.replace(states, steps=steps, done=is_idle | is_late)
@@ -140,8 +140,8 @@ def _act(
 
 
 @jax.named_scope("mission.drift")
-def _drift(keys: Key, mission: Mission, before: MissionState, after: MissionState) -> MissionState:
-    """The states with what driving has added to the errors of the robots' poses."""
+def drifted(keys: Key, mission: Mission, before: States, after: States) -> States:
+    """The states of B missions with what driving has added to the errors of the robots' poses."""
     way = after.scene.poses[..., :2] - before.scene.poses[..., :2]
     drift = jax.vmap(localisation.drift, (0, None, 0, 0))
     error = drift(

@@ -30,6 +30,20 @@ def drift(
     return error + scale * jnp.sqrt(driven)[:, None] * jax.random.normal(key, error.shape)
 
 
+def variance(
+    config: LocalisationConfig, driven: Float[Array, ""], distance: Float[Array, "*B"]
+) -> Float[Array, "*B"]:
+    """Variance of the offset between places that two robots note for one thing, in square metres.
+
+    Args:
+      driven: metres that each of them has driven at most.
+      distance: of the thing, in metres.
+    """
+    of_error, of_drift = _scale(*config.error)[0], _scale(*config.drift)[0]
+    position, _, heading = of_error**2 + driven * of_drift**2
+    return 2 * (position + heading * distance**2)
+
+
 def aimed_at(
     position: Float[Array, "2"], pose: Float[Array, "3"], error: Float[Array, "3"]
 ) -> Float[Array, "2"]:

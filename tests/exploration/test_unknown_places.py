@@ -188,6 +188,22 @@ def test_scans_show_floor_and_the_pois_in_view(begun, scanned):
     assert jnp.sum(after.grid.free & walls) <= 0.01 * jnp.sum(walls)
 
 
+def test_a_robot_that_errs_notes_places_where_it_believes_to_see_them(begun, scanned):
+    """All is off by its error alone, and what it sees and looks at is the same."""
+    error = jnp.array([0.3, 0.15, 0.0])
+    wrong = dataclasses.replace(begun, pose_error=jnp.tile(error, (2, 1)))
+    sense = jax.jit(rollout.sense, static_argnums=1)
+    for seed in range(1, 4):
+        wrong = sense(jax.random.key(seed), MISSION, MODELS, wrong)
+    used = np.asarray(scanned.slots.is_used & wrong.slots.is_used)
+    assert used.sum() > 1
+    off = (wrong.slots.position - scanned.slots.position)[used]
+    np.testing.assert_allclose(off, np.tile(error[:2], (used.sum(), 1)), atol=0.02)
+    # Two cells along x and one along y.
+    moved = np.asarray(wrong.grid.free)[2:, 1:] == np.asarray(scanned.grid.free)[:-2, :-1]
+    assert moved.mean() > 0.97
+
+
 def stood(state, *poses):
     """The state with robots at these poses."""
     scene = dataclasses.replace(state.scene, poses=jnp.array(poses))

@@ -52,6 +52,14 @@ def test_a_robot_heads_for_where_its_error_leads(pose, error, expected):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+def test_variances_of_places_as_worked_by_hand():
+    errors = LocalisationConfig(error=(0.03, 2.0), drift=(0.01, 0.5))
+    found = localisation.variance(errors, jnp.float32(16.0), jnp.array([0.0, 2.0]))
+    heading = np.radians(2.0) ** 2 + 16 * np.radians(0.5) ** 2
+    of_one = 0.03**2 + 16 * 0.01**2 + heading * np.array([0.0, 4.0])
+    np.testing.assert_allclose(found, 2 * of_one, rtol=1e-5)
+
+
 @pytest.fixture(scope="module")
 def simulation():
     return world.make_world(PRESETS["smoke"])
