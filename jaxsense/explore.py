@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -13,12 +13,12 @@ from jaxtyping import Array, Int
 
 from jaxsense import exploration, mission
 from jaxsense.config import Config
-from jaxsense.config.mission import CONTROL_PERIOD, LocalisationConfig
+from jaxsense.config.mission import CONTROL_PERIOD
 from jaxsense.config.options import Positional
 from jaxsense.config.section import Checked, limited, require_known
 from jaxsense.core.types import Key
 from jaxsense.dqn.agent import Agent
-from jaxsense.dqn.policies import Trained
+from jaxsense.dqn.policies import Trained, Values
 from jaxsense.dqn.team import Known
 from jaxsense.exploration import ExplorationState
 from jaxsense.exploration.state import NUM_FRONTIERS, num_slots
@@ -54,15 +54,15 @@ class PlaceArguments(Checked, place="arena"):
 
 
 class PoseArguments(Checked, place="localisation"):
-    """How well robots know their poses.
+    """How well robots know their poses; by default as in the run.
 
     Attributes:
       error: Standard deviations of a robot's constant error, in metres and degrees.
       drift: Standard deviations of what a metre of driving adds, in metres and degrees.
     """
 
-    error: tuple[float, float] = (0.0, 0.0)
-    drift: tuple[float, float] = (0.0, 0.0)
+    error: tuple[float, float] | None = None
+    drift: tuple[float, float] | None = None
 
 
 class Arguments(Checked):
@@ -106,12 +106,14 @@ def main(argv: list[str] | None = None) -> None:
         devices.start(1)
         trained, models = rundir.load(arguments.run, arguments.trust)
         config = _elsewhere(arguments, trained)
-        names = _policies(arguments.policy, models.agent, config)
+        policies = _playable(models.agent, config)
+        require_known("policy", arguments.policy, (*policies, "all"))
+        names = [*policies] if arguments.policy == "all" else [arguments.policy]
         cli.keep_programs(PROGRAM, arguments.cache, config)
-        play = Explorations(config, models, arguments.episodes, arguments.seed)
+        play = Explorations(config, models, policies, arguments.episodes, arguments.seed)
         played = {"run": str(arguments.run), "seed": arguments.seed, "robots": config.carried}
         arena = {name: getattr(config.arena, name) for name in vars(arguments.arena)}
-        errors = vars(arguments.localisation)
+        errors = {x: getattr(config.mission.localisation, x) for x in vars(arguments.localisation)}
         played |= {"arena": arena, "localisation": errors, "time_limit": arguments.time_limit}
         with rundir.begun(arguments.out, "explore") as place, Display() as display:
             report = functools.partial(display.show, metrics={})
@@ -139,7 +141,14 @@ def main(argv: list[str] | None = None) -> None:
 class Explorations:
     """Missions of all policies in the same arenas, side by side, with one program for all."""
 
-    def __init__(self, config: Config, models: Models, episodes: int, seed: int):
+    def __init__(
+        self,
+        config: Config,
+        models: Models,
+        policies: Mapping[str, Values],
+        episodes: int,
+        seed: int,
+    ):
         """Missions that have not begun.
 
         Raises:
@@ -147,6 +156,7 @@ class Explorations:
         """
         begin_key, self._key = jax.random.split(jax.random.key(seed))
         self._scenario, self._models = mission.make_mission(config), models
+        self._policies = policies
         self._chunks = math.ceil(config.mission.time_limit / CONTROL_PERIOD / _CHUNK)
         self._begin_keys = jax.random.split(begin_key, episodes)
         self._reset = jax.vmap(lambda key: exploration.reset(key, self._scenario, models))
@@ -184,7 +194,7 @@ class Explorations:
     ) -> Iterator[tuple[Measured, ExplorationState]]:
         """Metrics and the first mission after each chunk, until all missions are done."""
         report(0, 0)
-        index = jnp.int32([*exploration.POLICIES].index(name))
+        index = jnp.int32([*self._policies].index(name))
         for chunk in range(self._chunks):
             states, metrics = self._go_on(index, jax.random.fold_in(self._key, chunk), states)
             done = np.asarray(states.done)
@@ -201,18 +211,17 @@ class Explorations:
         models = self._models
 
         def policy(key: Key, models: Trained, known: Known) -> jax.Array:
-            return jax.lax.switch(index, [*exploration.POLICIES.values()], key, models, known)
+            return jax.lax.switch(index, [*self._policies.values()], key, models, known)
 
         keys = jax.random.split(key, len(states.done))
         after = exploration.rollout_batch(keys, self._scenario, models, policy, states, _CHUNK)
         return after, jax.vmap(lambda state: exploration.measure(models, state))(after)
 
 
-def _policies(wanted: str, agent: Agent, config: Config) -> list[str]:
-    """Names of the policies to play; a network for one number of PoIs plays none."""
-    known = [x for x in exploration.POLICIES if x != "latent" or agent.plays(_num_places(config))]
-    require_known("policy", wanted, (*known, "all"))
-    return known if wanted == "all" else [wanted]
+def _playable(agent: Agent, config: Config) -> dict[str, Values]:
+    """The policies that can play; a network for one number of PoIs cannot."""
+    plays = agent.plays(_num_places(config))
+    return {name: x for name, x in exploration.POLICIES.items() if plays or name != "latent"}
 
 
 def _num_places(config: Config) -> int:
@@ -226,7 +235,8 @@ def _elsewhere(arguments: Arguments, config: Config) -> Config:
     places = {**vars(arguments.arena), "fewest_pois": fewest}
     if config.mission.communication.own_maps:
         cli.warn(PROGRAM, "robots share one map, other than in the run")
-    poses = LocalisationConfig(**vars(arguments.localisation))
+    errors = {name: x for name, x in vars(arguments.localisation).items() if x is not None}
+    poses = dataclasses.replace(config.mission.localisation, **errors)
     return dataclasses.replace(
         config,
         arena=dataclasses.replace(config.arena, **places),

@@ -4,16 +4,23 @@ import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from smoke import error_line
 
-from jaxsense import ConfigError, exploration, explore, load_pretrained, mission
+from jaxsense import exploration, explore, load_pretrained, mission
 from jaxsense.dqn.agent import Agent
 from jaxsense.exploration.slots import Gospa
 from jaxsense.show import plots
 from jaxsense.summary import make
 from jaxsense.summary.blocks import FOUND
+
+
+def among_walls(config):
+    arena = dataclasses.replace(config.arena, num_pois=3, fewest_pois=2, inner_walls=1)
+    return dataclasses.replace(config, arena=arena)
+
 
 SMALL = ["--arena.side", "4", "--arena.num-pois", "3"]
 
@@ -58,8 +65,7 @@ def test_figures_of_two_missions_by_hand():
 
 def test_the_picture_shows_what_robots_know_before_what_is_there():
     config, models = load_pretrained("default")
-    arena = dataclasses.replace(config.arena, num_pois=3, fewest_pois=2, inner_walls=1)
-    config = dataclasses.replace(config, arena=arena)
+    config = among_walls(config)
     scenario = mission.make_mission(config)
     begun = jax.jit(exploration.reset, static_argnums=1)(jax.random.key(0), scenario, models)
     states = [begun, exploration.told(scenario, begun)]
@@ -97,11 +103,15 @@ def test_what_cannot_be_explored_is_refused_and_changes_nothing(
 
 def test_a_network_for_a_fixed_number_of_pois_plays_no_policy():
     config, models = load_pretrained("default")
-    dense = Agent(0.5, 0.0, None, 3, 2, 2, (4,))
-    assert explore._policies("all", models.agent, config) == [*exploration.POLICIES]
-    assert "latent" not in explore._policies("all", dense, config)
-    with pytest.raises(ConfigError, match="policy = 'latent': must be one of auction"):
-        explore._policies("latent", dense, config)
+    dense = dataclasses.replace(models, agent=Agent(0.5, 0.0, None, 3, 2, 2, (4,)))
+    assert [*explore._playable(models.agent, config)] == [*exploration.POLICIES]
+    playable = explore._playable(dense.agent, config)
+    assert [*playable] == [name for name in exploration.POLICIES if name != "latent"]
+    # The others do not ask the network.
+    play = explore.Explorations(among_walls(config), dense, playable, 2, 0)
+    jax.eval_shape(
+        play._go_on, jnp.int32(0), jax.random.key(0), jax.eval_shape(lambda: play._begun)
+    )
 
 
 @pytest.mark.slow  # compiles missions

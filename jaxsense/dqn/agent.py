@@ -15,7 +15,7 @@ from jaxsense.dqn.mdp import Mdp, Outcome, State
 from jaxsense.dqn.pooling import PoolingNetwork
 from jaxsense.dqn.team import TIME_SCALE, Team, Travel, num_features, surroundings
 
-_LEAST_DISCOUNT = 1e-30  # not 0 in float32: a far look keeps the sign of its value
+_LEAST_DISCOUNT = 1e-30  # not 0 in float32, so that the nearer of two far looks is worth more
 
 
 @pytree
@@ -91,7 +91,7 @@ class Agent:
         features = num_features(self.latent_size, self.num_modalities)
         known = observed.reshape(features, -1, *observed.shape[1:])
         seconds = TIME_SCALE * known[2 * self.latent_size]
-        discount = jnp.maximum(self.discount**seconds, _LEAST_DISCOUNT)
+        discount = jnp.maximum(self.discount**seconds, _LEAST_DISCOUNT / (1 + seconds) ** 2)
         of_pois = discount * of_pois - self.second_cost * seconds
         return jnp.concatenate([of_pois, after[-1:]])
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsense.config.mission import PLANNING_RADIUS
-from jaxsense.core.types import Index, Key, others
+from jaxsense.core.types import Index, Key, others, within_a_turn
 from jaxsense.dqn import policies
 from jaxsense.dqn.policies import Trained, Values
 from jaxsense.dqn.team import Known, Team
@@ -20,16 +20,15 @@ from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
 from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, Mission
 from jaxsense.models import Models, make_travel
-from jaxsense.sim import viewpoints
 
 _VIEW_SIDES = 16  # directions from which a robot may look at a slot
 _VIEW_SHARES = (0.6, 0.9)  # of the longest distance of a look
 _BESIDE = 1.0  # m, between two robots' goals at one frontier
 _STANDS = 0.02  # m/s, below which a robot does not drive
+_AT_GOAL = 0.1  # m
 _SAME_GOAL = 0.2  # m, between goals, or places of a look, that count as one
 _SAMPLES = 16  # of a line of sight
-# Of the floor, which stays unseen: .01 to .02 of the PoIs are missed. All of it costs 18 s, .01.
-_IGNORED = 0.04
+_IGNORED = 0.03  # of the floor, which stays unseen with .01 of the PoIs; to see it takes 15 s
 _FRONTIER = 6.0  # of a frontier where a PoI is certain, in looks
 _TAKEN = 60.0  # s, detour that a robot prefers to what another one heads for
 
@@ -48,12 +47,12 @@ def look_first(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
 
 
 def gain_rate(key: Key, models: Trained, known: Known) -> Float[Array, " A"]:
-    """Takes the most a second; a frontier counts as the square root of what may be there."""
+    """Takes the most a second: a look counts 1, a frontier 6 roots of the chance of a PoI there."""
     team, is_frontier = known.team, _is_frontier(known)
     gains = jnp.where(is_frontier, _FRONTIER * jnp.sqrt(known.exists), 1.0)
     competes = (team.modality == known.modality)[:, None] | is_frontier[None]
     is_taken = jnp.any(team.heads & team.others(known.robot)[:, None] & competes, axis=0)
-    rates = gains / (known.times[known.robot] + _TAKEN * is_taken)
+    rates = gains / (1 + known.times[known.robot] + _TAKEN * is_taken)
     values = _nearest(key, models, known)
     return jnp.where(values > 0, jnp.append(rates, 0.0), values)
 
@@ -87,8 +86,8 @@ def choose(
 ) -> ExplorationState:
     """Lets a robot choose, and plans its way."""
     known, goals = options_of(mission, models, state, robot)
-    target = action_of(policy(key, models, known), known)
-    nothing = len(goals)
+    target, nothing = action_of(policy(key, models, known), known), len(goals)
+    target = jnp.where(target < 0, nothing, target)  # NaN
     goal = goals[jnp.minimum(target, nothing - 1)]
     goal = jnp.where(target == nothing, state.believed_poses[robot], goal)
     way = grids.distances(state.grid, goal[:2], blocked(mission, state, robot))
@@ -117,12 +116,11 @@ def options_of(
     """
     pose, modality = state.believed_poses[robot], mission.modalities[robot]
     lengths = grids.distances(state.grid, pose[:2], blocked(mission, state, robot))
-    arena = mission.config.arena
-    frontiers = grids.frontiers(
-        state.grid, modality, lengths, NUM_FRONTIERS, arena.poi_gap, _IGNORED * arena.side**2
-    )
+    arena, slots, robots = mission.config.arena, state.slots, state.robots
+    room = grids.room(state.grid, arena.poi_gap)
+    ignored = _IGNORED * arena.side**2
+    frontiers = grids.frontiers(state.grid, modality, lengths, NUM_FRONTIERS, room, ignored)
     views, to_view = _views(mission, models, state, robot, lengths)
-    slots, robots = state.slots, state.robots
     number = len(slots.existence)
     to_slot = slots.position - views
     yaw = jnp.append(jnp.arctan2(to_slot[:, 1], to_slot[:, 0]), frontiers.heading)
@@ -130,6 +128,7 @@ def options_of(
     length = jnp.append(to_view, frontiers.distance)
     is_open = slots.is_used & objects.found(slots) & (state.failures[:, modality] < ATTEMPTS)
     to_goal = jnp.linalg.norm(frontiers.position[None] - robots.goal[:, None, :2], axis=-1)
+    to_goal = jnp.where(frontiers.is_valid[None], to_goal, jnp.inf)
     beside = jnp.where(
         jnp.min(to_goal, axis=1) < _BESIDE, number + jnp.argmin(to_goal, axis=1), len(place)
     )
@@ -142,25 +141,32 @@ def options_of(
         works=(robots.target < len(place)) | (jnp.arange(len(robots.target)) == robot),
         target=jnp.where(explores, beside, robots.target),
     )
-    travel = make_travel(mission.config)
-    ahead = jnp.abs(jax.vmap(viewpoints.bearing, (None, 0))(pose, team.positions))
-    looks = jnp.where(jnp.arange(len(place)) < number, travel.look_seconds, 0.0)
-    seconds = ahead / travel.turn_rate + length / travel.speed + looks
-    times = travel.times(team, jnp.zeros(team.heads.shape))
+    expected = arena.density * _shares(mission)[modality] * frontiers.size
+    exists = jnp.append(jnp.ones(number), -jnp.expm1(-expected))
+    team = dataclasses.replace(team, present=team.present & (exists > 0))
+    # Robots look from afar, and drive to a frontier.
+    look, is_look = make_travel(mission.config), jnp.arange(len(place)) < number
+    drive = dataclasses.replace(look, view_distance=0.0, look_seconds=0.0)
+    travels = [x.times(team, jnp.zeros(team.heads.shape)) for x in (look, drive)]
+    times = jnp.where(is_look[None], *travels)
+    turn = jnp.where(
+        length > _AT_GOAL, jnp.arctan2(*(team.positions - pose[None, :2]).T[::-1]), yaw
+    )
+    own = jnp.abs(within_a_turn(turn - pose[2])) / look.turn_rate + length / look.speed
+    own += jnp.where(is_look, look.look_seconds, 0.0)
     unseen = objects.empty(models, NUM_FRONTIERS)
     points = jax.tree.map(
         lambda *x: jnp.concatenate(x),
         *(dataclasses.replace(x, overflow=()) for x in (slots, unseen)),
     )
-    expected = arena.density * _shares(mission)[modality] * frontiers.size
     known = Known(
         belief=points.belief,
         looks=points.times_seen,
         log_posterior=points.log_posterior,
         team=team,
-        times=times.at[robot].set(seconds),
+        times=times.at[robot].set(own),
         robot=jnp.asarray(robot),
-        exists=jnp.append(jnp.ones(number), -jnp.expm1(-expected)),
+        exists=exists,
     )
     return known, jnp.append(place, yaw[:, None], axis=1)
 

@@ -290,12 +290,25 @@ def way(grid: Grid, distances: Lengths, position: Place) -> Place:
     return jnp.where(is_there, ends[last], position)
 
 
+def room(grid: Grid, gap: float) -> Cells:
+    """Cells where a PoI may stand, as far as known.
+
+    Args:
+      gap: from inner walls, in metres, and half of it from outer walls; static.
+    """
+    to_border = _to_outer_wall(grid)
+    inner, near_wall = to_border > grid.cell, grid.occupied
+    for _ in range(1, int(gap / grid.cell + 1e-6)):
+        near_wall = _is_beside(near_wall & inner, _AROUND)
+    return ~grid.occupied & ~near_wall & (to_border > gap / 2)
+
+
 def frontiers(
-    grid: Grid, modality: Index, distances: Lengths, number: int, gap: float, ignored: float
+    grid: Grid, modality: Index, distances: Lengths, number: int, room: Cells, ignored: float
 ) -> Frontiers:
     """Places next to floor that nobody has seen and this modality has not given up.
 
-    Two by two cells of it must have room for a PoI.
+    Two by two cells of it must have room.
 
     One after the other, the reachable cell in or next to unseen floor with the most of it around,
     where near floor counts more, and no place before it within 1 m. Places with less than .08 m2
@@ -304,14 +317,10 @@ def frontiers(
     Args:
       distances: of all cells from the robot, in metres, see `distances`.
       number: of places, static.
-      gap: that PoIs keep from inner walls, in metres, and half of it from the outer ones; static.
+      room: floor that is worth seeing, see `room`.
       ignored: unseen floor up to which there is no place, in square metres.
     """
-    near_wall = grid.occupied
-    for _ in range(1, int(gap / grid.cell)):
-        near_wall = _is_beside(near_wall, _AROUND)
-    left_out = jnp.any(grid.seen, axis=0) | grid.given_up[modality] | grid.occupied | near_wall
-    unseen = _squares(~left_out & (_to_outer_wall(grid) > gap / 2))
+    unseen = _squares(room & ~jnp.any(grid.seen, axis=0) & ~grid.given_up[modality])
     reachable = jnp.isfinite(distances)
     cells, area = np.arange(len(distances)), grid.cell**2
     is_worth = area * jnp.sum(unseen) > ignored

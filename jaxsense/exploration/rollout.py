@@ -229,7 +229,8 @@ def _sense(
     in_range &= candidates.distance >= config.viewpoint.min_distance
     in_range &= jnp.abs(candidates.bearing) <= jnp.radians(_FACING)
     reach, radius = config.arena.side / 2, config.arena.poi_radius
-    is_inside = jnp.max(jnp.abs(candidates.position), axis=-1) < reach - radius
+    margin = 2 * jnp.sqrt(spread(candidates.distance)) - radius
+    is_inside = jnp.max(jnp.abs(candidates.position), axis=-1) < reach + margin
     is_valid = candidates.is_valid & is_inside & (is_there | ~in_range)
     doubt = spread(candidates.distance)[:, None, None] * jnp.eye(2)[None]
     covariance = candidates.covariance + doubt
@@ -252,6 +253,9 @@ def _sense(
     if sensor.measures_distance or sensor.channels == proposals.RGB:
         looked_at = _looks(state, robot) & (jnp.arange(len(slots.is_used)) == _target(state, robot))
         missed = _expected(mission, state, sensor, readings, robot) & ~found.is_seen & ~looked_at
+        # What is beside another robot may have been taken for it.
+        apart = jnp.linalg.norm(slots.position[:, None] - beside[None], axis=-1)
+        missed &= jnp.all(apart > radii.T + radius, axis=1)
         slots = objects.with_misses(models, slots, missed, _DETECTION)
         state = dataclasses.replace(state, slots=objects.merged(models, slots, radius))
     return _look(mission, models, state, readings, candidates, found, robot, modality)
@@ -377,7 +381,9 @@ def _look(
         looked_from=slots.looked_from.at[target, modality, at].set(place),
     )
     is_target = jnp.arange(len(slots.is_used)) == target
-    after = objects.with_misses(models, after, is_target & sees & ~detection.is_there, _SHOWN)
+    # A robot that errs may have looked beside it.
+    shows = sees & (is_shown | ~jnp.any(state.pose_error != 0))
+    after = objects.with_misses(models, after, is_target & shows & ~detection.is_there, _SHOWN)
     fails = looks & ~detects
     return _with_failure(state, after, robot, modality, fails, pose[:2]).with_robot(
         robot,

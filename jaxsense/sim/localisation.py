@@ -33,7 +33,7 @@ def drift(
 def variance(
     config: LocalisationConfig, driven: Float[Array, ""], distance: Float[Array, "*B"]
 ) -> Float[Array, "*B"]:
-    """Variance of the offset between places that two robots note for one thing, in square metres.
+    """Variance between the places that two robots on one side of a thing note, in square metres.
 
     Args:
       driven: metres that each of them has driven at most.

@@ -63,6 +63,10 @@ def test_values_of_setting_out_as_worked_by_hand(monkeypatch):
     np.testing.assert_allclose(both.T, [[1.8, 3.0, 0.6, 0], [-2.2, -3.0, -1.4, 0]], rtol=1e-6)
     far = Agent(0.2, 0.0, TRAVEL, 3, 1, 1, (8,)).values(jnp.array([1.0, -1, -1, 0]), 900 * seen)
     assert jnp.sign(far).tolist() == [1, -1, -1, 0]  # half an hour away and more
+    # Of two PoIs more than 43 s away, where .2^t is less than 1e-30, the nearer counts more.
+    times = jnp.zeros((9, 3)).at[2].set(jnp.array([4.4, 9.0, 5.0])).reshape(-1)
+    far = Agent(0.2, 0.0, TRAVEL, 3, 1, 1, (8,)).values(jnp.ones(4), times)
+    assert far[0] > far[2] > far[1] > 0
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,11 @@ SIDE = 6.0  # 40 cells of .15 m
 NOTHING, POSE = jnp.zeros((0, 3)), jnp.array([-1.5, 0.0, 0.0])
 ANGLES = np.linspace(-np.pi, np.pi, 720, endpoint=False)
 distances, way, with_view = map(jax.jit, (grids.distances, grids.way, grids.with_view))
-frontiers = jax.jit(functools.partial(grids.frontiers, number=4, gap=0.1, ignored=0.0))
+
+
+@functools.partial(jax.jit, static_argnames="ignored")
+def frontiers(grid, modality, paths, ignored=0.0):
+    return grids.frontiers(grid, modality, paths, 4, ~grid.occupied, ignored)
 
 
 @jax.jit
@@ -142,8 +146,21 @@ def test_frontiers_lie_at_reachable_unseen_floor():
     for modality, number in ((0, 1), (1, 2)):
         left = frontiers(grid.replace(given_up=given_up), modality, paths)
         assert left.is_valid.sum() == number
+    # Of 1.62 m2, all or nothing is left.
+    assert frontiers(grid, 1, paths, ignored=1.6).is_valid.sum() == 2
+    assert frontiers(grid, 1, paths, ignored=1.7).is_valid.sum() == 0
     closed = frontiers(grid, 1, distances(two_rooms(door=0), POSE[:2], NOTHING))
     np.testing.assert_array_equal(closed.is_valid, [True, False, False, False])
+
+
+def test_room_for_pois_as_worked_by_hand():
+    # A wall in row 20: with a gap of two cells, one beside it and one at the border have no room.
+    for gap, cells in ((0.3, 1), (0.1, 0)):
+        expected = np.ones((40, 40), bool)
+        expected[20 - cells : 21 + cells] = False
+        border = [*range(cells), *range(40 - cells, 40)]
+        expected[border] = expected[:, border] = False
+        np.testing.assert_array_equal(grids.room(two_rooms(door=0), gap), expected)
 
 
 def test_many_missions_equal_a_loop():
