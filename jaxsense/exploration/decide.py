@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsense.config.mission import PLANNING_RADIUS
 from jaxsense.core.types import Index, Key, others, within_a_turn
@@ -15,7 +15,7 @@ from jaxsense.dqn.team import Known, Team
 from jaxsense.exploration import grid as grids
 from jaxsense.exploration import proposals
 from jaxsense.exploration import slots as objects
-from jaxsense.exploration.grid import Grid
+from jaxsense.exploration.grid import Frontiers, Grid
 from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
 from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, Mission
@@ -116,59 +116,74 @@ def options_of(
     """
     pose, modality = state.believed_poses[robot], mission.modalities[robot]
     lengths = grids.distances(state.grid, pose[:2], blocked(mission, state, robot))
-    arena, slots, robots = mission.config.arena, state.slots, state.robots
-    room = grids.room(state.grid, arena.poi_gap)
-    ignored = _IGNORED * arena.side**2
+    arena, slots, number = mission.config.arena, state.slots, len(state.slots.existence)
+    room, ignored = grids.room(state.grid, arena.poi_gap), _IGNORED * arena.side**2
     frontiers = grids.frontiers(state.grid, modality, lengths, NUM_FRONTIERS, room, ignored)
     views, to_view = _views(mission, models, state, robot, lengths)
-    number = len(slots.existence)
     to_slot = slots.position - views
     yaw = jnp.append(jnp.arctan2(to_slot[:, 1], to_slot[:, 0]), frontiers.heading)
-    place = jnp.concatenate([views, frontiers.position])
+    goals = jnp.append(jnp.concatenate([views, frontiers.position]), yaw[:, None], axis=1)
     length = jnp.append(to_view, frontiers.distance)
     is_open = slots.is_used & objects.found(slots) & (state.failures[:, modality] < ATTEMPTS)
-    to_goal = jnp.linalg.norm(frontiers.position[None] - robots.goal[:, None, :2], axis=-1)
-    to_goal = jnp.where(frontiers.is_valid[None], to_goal, jnp.inf)
-    beside = jnp.where(
-        jnp.min(to_goal, axis=1) < _BESIDE, number + jnp.argmin(to_goal, axis=1), len(place)
-    )
-    explores = (robots.target >= number) & (robots.target < len(place))
-    team = Team(
-        positions=jnp.concatenate([slots.position, frontiers.position]),
-        present=jnp.append(is_open, frontiers.is_valid) & jnp.isfinite(length),
-        poses=state.believed_poses,
-        modality=mission.modalities,
-        works=(robots.target < len(place)) | (jnp.arange(len(robots.target)) == robot),
-        target=jnp.where(explores, beside, robots.target),
-    )
     expected = arena.density * _shares(mission)[modality] * frontiers.size
     exists = jnp.append(jnp.ones(number), -jnp.expm1(-expected))
-    team = dataclasses.replace(team, present=team.present & (exists > 0))
-    # Robots look from afar, and drive to a frontier.
-    look, is_look = make_travel(mission.config), jnp.arange(len(place)) < number
-    drive = dataclasses.replace(look, view_distance=0.0, look_seconds=0.0)
-    travels = [x.times(team, jnp.zeros(team.heads.shape)) for x in (look, drive)]
-    times = jnp.where(is_look[None], *travels)
-    turn = jnp.where(
-        length > _AT_GOAL, jnp.arctan2(*(team.positions - pose[None, :2]).T[::-1]), yaw
+    target = _headed_for(state, frontiers)
+    team = Team(
+        positions=jnp.concatenate([slots.position, frontiers.position]),
+        present=jnp.append(is_open, frontiers.is_valid) & jnp.isfinite(length) & (exists > 0),
+        poses=state.believed_poses,
+        modality=mission.modalities,
+        works=(state.robots.target < len(goals)) | (jnp.arange(len(target)) == robot),
+        target=target,
     )
-    own = jnp.abs(within_a_turn(turn - pose[2])) / look.turn_rate + length / look.speed
-    own += jnp.where(is_look, look.look_seconds, 0.0)
-    unseen = objects.empty(models, NUM_FRONTIERS)
-    points = jax.tree.map(
-        lambda *x: jnp.concatenate(x),
-        *(dataclasses.replace(x, overflow=()) for x in (slots, unseen)),
-    )
+    nobody = dataclasses.replace(objects.empty(models, NUM_FRONTIERS), overflow=())
+    points = dataclasses.replace(slots, overflow=())
+    points = jax.tree.map(lambda *x: jnp.concatenate(x), points, nobody)
     known = Known(
         belief=points.belief,
         looks=points.times_seen,
         log_posterior=points.log_posterior,
         team=team,
-        times=times.at[robot].set(own),
+        times=_times(mission, team, robot, length, yaw, number),
         robot=jnp.asarray(robot),
         exists=exists,
     )
-    return known, jnp.append(place, yaw[:, None], axis=1)
+    return known, goals
+
+
+def _headed_for(state: ExplorationState, frontiers: Frontiers) -> Int[Array, " R"]:
+    """The place that each robot heads for; of frontiers, the one next to its goal."""
+    target, number = state.robots.target, len(state.slots.existence)
+    nothing = number + NUM_FRONTIERS
+    to_goal = frontiers.position[None] - state.robots.goal[:, None, :2]
+    apart = jnp.where(frontiers.is_valid[None], jnp.linalg.norm(to_goal, axis=-1), jnp.inf)
+    is_beside = jnp.min(apart, axis=1) < _BESIDE
+    beside = jnp.where(is_beside, number + jnp.argmin(apart, axis=1), nothing)
+    return jnp.where((target >= number) & (target < nothing), beside, target)
+
+
+def _times(
+    mission: Mission,
+    team: Team,
+    robot: Index,
+    length: Float[Array, " N"],
+    yaw: Float[Array, " N"],
+    number: int,
+) -> Float[Array, "R N"]:
+    """Seconds until robots have looked at the first places, and have reached the others.
+
+    The robot's own by the lengths of its paths, in metres, those of others as if nothing stood
+    between.
+    """
+    look, is_look = make_travel(mission.config), jnp.arange(len(length)) < number
+    drive = dataclasses.replace(look, view_distance=0.0, look_seconds=0.0)
+    times = [x.times(team, jnp.zeros(team.heads.shape)) for x in (look, drive)]
+    pose = team.poses[robot]
+    x, y = (team.positions - pose[None, :2]).T
+    turn = within_a_turn(jnp.where(length > _AT_GOAL, jnp.arctan2(y, x), yaw) - pose[2])
+    own = jnp.abs(turn) / look.turn_rate + length / look.speed
+    own += jnp.where(is_look, look.look_seconds, 0.0)
+    return jnp.where(is_look[None], *times).at[robot].set(own)
 
 
 def _shares(mission: Mission) -> Float[Array, " M"]:
