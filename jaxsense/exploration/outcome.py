@@ -44,7 +44,7 @@ def measure(models: Models, state: ExplorationState) -> dict[str, PyTree[Array]]
     return {
         "gospa": result,
         "off": off,
-        "existence": jnp.where(slots.is_used, jax.nn.sigmoid(slots.existence), jnp.nan),
+        "existence": jnp.where(slots.is_used, objects.probability(slots), jnp.nan),
         "is_object": jnp.any(is_near & (is_own | ~is_there[None]), axis=1),
         "present": jnp.sum(layout.present),
         "found": jnp.sum(is_there),

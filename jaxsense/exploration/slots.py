@@ -22,6 +22,7 @@ _DRIFT = 1e-5  # m2 a scan; errors that scans share, such as those of poses, do 
 _FAR = 1e3  # m, where no robot comes near
 _SUREST = 10.0  # log-odds; more would hold out against too many misses
 _SURE = 3.0  # log-odds; slots below its negative are cleared
+_EVIDENCE = 0.9, -3.9  # factor of log-odds, and addend: logistic regression on 224 missions
 _FIRST = -2.0  # log-odds; of candidates that no other scan confirms, few are objects
 
 
@@ -115,6 +116,15 @@ def empty(models: Models, number: int) -> Slots:
 def found(slots: Slots) -> Bool[Array, " S"]:
     """Which slots almost surely hold an object."""
     return slots.is_used & (slots.existence >= _SURE)
+
+
+def probability(slots: Slots) -> Float[Array, " S"]:
+    """Probability that a slot holds an object, and no better slot does.
+
+    Evidence counts less than its sum, because scans share their errors, and a slot may be the
+    second of one object.
+    """
+    return jax.nn.sigmoid(_EVIDENCE[0] * slots.existence + _EVIDENCE[1])
 
 
 def associate(slots: Slots, candidates: Candidates, radius: Number) -> Association:
