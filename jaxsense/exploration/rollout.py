@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -208,8 +209,7 @@ def _sense(
         seconds=seconds,
     )
     beside = others(state.believed_poses[:, :2], robot)
-    driven = state.time * amiro.MAX_SPEED
-    spread = functools.partial(localisation.variance, config.mission.localisation, driven)
+    spread = _spread(mission, state)
     far = jnp.linalg.norm(beside - pose[None, :2], axis=-1)
     radii = 2 * amiro.BODY_RADIUS + 2 * jnp.sqrt(spread(far))[:, None]
     candidates = proposals.propose(
@@ -259,6 +259,12 @@ def _sense(
         slots = objects.with_misses(models, slots, missed, _DETECTION)
         state = dataclasses.replace(state, slots=objects.merged(models, slots, radius))
     return _look(mission, models, state, readings, candidates, found, robot, modality)
+
+
+def _spread(mission: Mission, state: ExplorationState) -> Callable[[jax.Array], jax.Array]:
+    """Variance of places by their distance, as far as robots know how much they may err."""
+    driven = state.time * amiro.MAX_SPEED
+    return functools.partial(localisation.variance, mission.config.mission.localisation, driven)
 
 
 def outer_walls(side: float) -> Float[Array, "4 4"]:
@@ -381,8 +387,8 @@ def _look(
         looked_from=slots.looked_from.at[target, modality, at].set(place),
     )
     is_target = jnp.arange(len(slots.is_used)) == target
-    # A robot that errs may have looked beside it.
-    shows = sees & (is_shown | ~jnp.any(state.pose_error != 0))
+    # A robot that may err has perhaps looked beside it.
+    shows = sees & (is_shown | (_spread(mission, state)(distance) == 0))
     after = objects.with_misses(models, after, is_target & shows & ~detection.is_there, _SHOWN)
     fails = looks & ~detects
     return _with_failure(state, after, robot, modality, fails, pose[:2]).with_robot(
