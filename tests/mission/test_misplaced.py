@@ -11,7 +11,7 @@ from teams import CONFIG, POSES, POSITIONS, with_config
 from jaxsense import mission
 from jaxsense.config.mission import LocalisationConfig, Search
 from jaxsense.mission import act, decide
-from jaxsense.mission.rollout import _drift
+from jaxsense.mission.rollout import drifted
 from jaxsense.mission.state import DRIVING, FACING, Robot
 
 CAMERA, LIDAR = 0, 1
@@ -84,7 +84,7 @@ def test_errors_are_of_the_robots_that_drive(team, arena_of):
     @jax.jit
     def error_of(config):
         key = jax.random.key(0)[None]
-        return _drift(key, with_config(team, config), *batch).pose_error[0]
+        return drifted(key, with_config(team, config), *batch).pose_error[0]
 
     error = error_of(config)
     np.testing.assert_array_equal(error[0], 0.0)
