@@ -16,7 +16,7 @@ from jaxsense.exploration import grid as grids
 from jaxsense.exploration import proposals
 from jaxsense.exploration import slots as objects
 from jaxsense.exploration.grid import Frontiers, Grid
-from jaxsense.exploration.state import NUM_FRONTIERS, ExplorationState
+from jaxsense.exploration.state import AT_GOAL, NUM_FRONTIERS, ExplorationState
 from jaxsense.mission.decide import action_of
 from jaxsense.mission.state import ATTEMPTS, Mission
 from jaxsense.models import Models, make_travel
@@ -25,7 +25,6 @@ _VIEW_SIDES = 16  # directions from which a robot may look at a slot
 _VIEW_SHARES = (0.6, 0.9)  # of the longest distance of a look
 _BESIDE = 1.0  # m, between two robots' goals at one frontier
 _STANDS = 0.02  # m/s, below which a robot does not drive
-_AT_GOAL = 0.1  # m
 _SAME_GOAL = 0.2  # m, between goals, or places of a look, that count as one
 _SAMPLES = 16  # of a line of sight
 _IGNORED = 0.03  # of the floor, which stays unseen with .01 of the PoIs; to see it takes 15 s
@@ -180,7 +179,7 @@ def _times(
     times = [x.times(team, jnp.zeros(team.heads.shape)) for x in (look, drive)]
     pose = team.poses[robot]
     x, y = (team.positions - pose[None, :2]).T
-    turn = within_a_turn(jnp.where(length > _AT_GOAL, jnp.arctan2(y, x), yaw) - pose[2])
+    turn = within_a_turn(jnp.where(length > AT_GOAL, jnp.arctan2(y, x), yaw) - pose[2])
     own = jnp.abs(turn) / look.turn_rate + length / look.speed
     own += jnp.where(is_look, look.look_seconds, 0.0)
     return jnp.where(is_look[None], *times).at[robot].set(own)

@@ -26,6 +26,8 @@ NUM_FRONTIERS = 12
 """Frontiers that a robot chooses from."""
 SPARE_SLOTS = 4
 """Slots beyond the largest number of PoIs, for false candidates until they are refuted."""
+AT_GOAL = 0.1
+"""Distance from a goal at which a robot is there, in metres."""
 _CERTAIN = 10.0  # log-odds of objects
 _CLEAR = 4  # evidence of cells
 _EXACT = 1e-4  # of a square metre
@@ -106,6 +108,31 @@ class ExplorationState:
         """Changes one robot."""
         changed = {n: getattr(self.robots, n).at[robot].set(x) for n, x in changes.items()}
         return dataclasses.replace(self, robots=dataclasses.replace(self.robots, **changed))
+
+    def target_slot(self, robot: Index) -> Int[Array, ""]:
+        """The slot that a robot heads for; the last one if it heads for none."""
+        return jnp.minimum(self.robots.target[robot], len(self.slots.is_used) - 1)
+
+    def is_at_goal(self, robot: Index) -> Bool[Array, ""]:
+        """Whether a robot has arrived, as it believes."""
+        way = self.robots.goal[robot, :2] - self.believed_poses[robot, :2]
+        return jnp.linalg.norm(way) < AT_GOAL
+
+    def with_failure(
+        self, robot: Index, modality: Index, fails: Bool[Array, ""], position: Float[Array, "2"]
+    ) -> "ExplorationState":
+        """Notes from where a look at the robot's target failed; cleared slots have no failures."""
+        target, is_used = self.target_slot(robot), self.slots.is_used
+        number, places = self.failures[target, modality], self.failed_from
+        at = number % places.shape[2]
+        place = jnp.where(fails, position, places[target, modality, at])
+        places = places.at[target, modality, at].set(place)
+        failures = self.failures.at[target, modality].set(number + fails)
+        return dataclasses.replace(
+            self,
+            failures=jnp.where(is_used[:, None], failures, 0),
+            failed_from=jnp.where(is_used[:, None, None, None], places, jnp.inf),
+        )
 
 
 @checks.typed

@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from jaxsense import ConfigError, exploration, load_pretrained, mission
-from jaxsense.exploration import decide, proposals, rollout, slots
+from jaxsense.exploration import decide, proposals, rollout, sensing, slots
 from jaxsense.mission.roadmap import require_known_places
 
 CONFIG, MODELS = load_pretrained("default")
@@ -22,6 +22,7 @@ def among_walls(config, **changes):
 
 HIDDEN = among_walls(CONFIG)
 MISSION = mission.make_mission(HIDDEN)
+ERRORS = {"error": (0.02, 1.0), "drift": (0.005, 0.2)}
 NOTHING = HIDDEN.arena.num_pois + 4 + 12
 
 
@@ -38,7 +39,7 @@ def told(begun):
 @pytest.fixture(scope="module")
 def scanned(begun):
     """After three scans of each robot."""
-    sense = jax.jit(rollout.sense, static_argnums=1)
+    sense = jax.jit(sensing.sense, static_argnums=1)
     for seed in range(1, 4):
         begun = sense(jax.random.key(seed), MISSION, MODELS, begun)
     return begun
@@ -175,6 +176,39 @@ def test_the_network_alone_chooses_looks_and_frontiers(scanned):
     assert len({*choices}) > 1
 
 
+def test_a_network_without_numbers_chooses_nothing(scanned):
+    broken = jax.tree.map(lambda x: x * jnp.nan, MODELS.q_networks)
+    models, policy = dataclasses.replace(MODELS, q_networks=broken), exploration.POLICIES["latent"]
+    chosen = decide.choose(jax.random.key(0), MISSION, models, policy, scanned, 0)
+    assert chosen.robots.target[0] == NOTHING
+    np.testing.assert_array_equal(chosen.robots.goal[0], scanned.scene.poses[0])
+
+
+def test_a_sensor_that_finds_nothing_explores_nothing(scanned, monkeypatch):
+    number = len(scanned.slots.existence)
+    assert jnp.any(options(scanned)[0].team.present[number:])
+    monkeypatch.setattr(decide, "_shares", lambda mission: jnp.zeros(2))
+    known, _ = decide.options_of(MISSION, MODELS, scanned, 0)
+    assert not jnp.any(known.team.present[number:])
+
+
+def test_a_robot_that_errs_looks_where_its_scan_shows_the_object(told):
+    slot = int(jnp.argmax(told.scene.layout.present))
+    place = decide.options_of(MISSION, MODELS, told, 1)[1][slot]
+    sideways = jnp.array([-jnp.sin(place[2]), jnp.cos(place[2]), 0.0])
+    believed = place + 0.15 * sideways  # ten degrees and more, seen from the object
+    there = stood(told, told.scene.poses[0], place).with_robot(
+        1, target=jnp.int32(slot), goal=believed
+    )
+    there = dataclasses.replace(there, pose_error=jnp.stack([jnp.zeros(3), believed - place]))
+    sense = jax.jit(sensing.sense, static_argnums=1)
+    after = sense(jax.random.key(1), MISSION, MODELS, there)
+    assert after.slots.times_seen[slot, 1] == 1
+    labels = np.array(HIDDEN.label_of_class("lidar"))
+    shown = MODELS.fusion.class_probabilities(jax.tree.map(lambda x: x[slot], after.slots.belief))
+    assert labels[jnp.argmax(shown)] == labels[told.classes[slot]]
+
+
 def test_scans_show_floor_and_the_pois_in_view(begun, scanned):
     after = scanned
     assert jnp.sum(after.grid.free) > 100
@@ -192,7 +226,7 @@ def test_a_robot_that_errs_notes_places_where_it_believes_to_see_them(begun, sca
     """All is off by its error alone, and what it sees and looks at is the same."""
     error = jnp.array([0.3, 0.15, 0.0])
     wrong = dataclasses.replace(begun, pose_error=jnp.tile(error, (2, 1)))
-    sense = jax.jit(rollout.sense, static_argnums=1)
+    sense = jax.jit(sensing.sense, static_argnums=1)
     for seed in range(1, 4):
         wrong = sense(jax.random.key(seed), MISSION, MODELS, wrong)
     used = np.asarray(scanned.slots.is_used & wrong.slots.is_used)
@@ -222,7 +256,7 @@ def open_floor(told):
 
 
 def test_bodies_and_unknown_floor_hide_objects(open_floor):
-    sight = jax.jit(rollout._in_sight, static_argnums=(0, 2))
+    sight = jax.jit(sensing._in_sight, static_argnums=(0, 2))
     away, between = (-2.0, -2.0, 0.0), (0.5, 0.0, 0.0)
     seen = sight(MISSION, stood(open_floor, (0.0, 0.0, 0.0), away), 0)[:3]
     np.testing.assert_array_equal(seen, [True, False, True])  # the second is behind the first
@@ -278,7 +312,7 @@ def test_a_viewpoint_out_of_reach_is_one_of_a_failed_look(open_floor):
 
 
 def test_only_beams_that_pass_its_place_refute_an_object(open_floor):
-    expected = jax.jit(rollout._expected, static_argnums=(0, 2, 4))
+    expected = jax.jit(sensing._expected, static_argnums=(0, 2, 4))
     lidar = MISSION.world.sensors[1]
     state = stood(open_floor, (-2.0, -2.0, 0.0), (0.0, 0.0, 0.0))
     ahead = np.abs(lidar.angles) < 0.01
@@ -322,21 +356,26 @@ def test_places_are_either_known_or_found(begun):
 
 
 @pytest.mark.slow
-def test_robots_find_all_pois_and_what_they_are():
-    keys = jax.random.split(jax.random.key(21), (2, 8))
+@pytest.mark.parametrize(("policy", "errors"), [("nearest", {}), ("latent", ERRORS)])
+def test_robots_find_all_pois_and_what_they_are(policy, errors):
+    poses = dataclasses.replace(HIDDEN.mission.localisation, **errors)
+    config = dataclasses.replace(HIDDEN.mission, localisation=poses)
+    scenario = mission.make_mission(dataclasses.replace(HIDDEN, mission=config))
+    keys, choose = jax.random.split(jax.random.key(21), (2, 8)), exploration.POLICIES[policy]
 
     @jax.jit
     def play(keys):
-        states = jax.vmap(lambda key: exploration.reset(key, MISSION, MODELS))(keys[0])
-        policy = exploration.POLICIES["nearest"]
-        states = exploration.rollout_batch(keys[1], MISSION, MODELS, policy, states, 2400)
-        return states, jax.vmap(lambda state: exploration.measure(MODELS, state))(states)
+        begun = jax.vmap(lambda key: exploration.reset(key, scenario, MODELS))(keys[0])
+        states = exploration.rollout_batch(keys[1], scenario, MODELS, choose, begun, 2400)
+        found = jax.vmap(lambda state: exploration.measure(MODELS, state))(states)
+        return begun, states, found
 
-    states, found = jax.tree.map(np.asarray, play(keys))
+    begun, states, found = jax.tree.map(np.asarray, play(keys))
     present = found["present"].sum()
     assert found["found"].sum() >= present - 1
     assert found["false"].sum() <= 2
     assert found["right"].sum() >= present - 2
-    assert found["gospa"].position_error.max() < 0.05
+    assert found["gospa"].position_error.max() < (0.2 if errors else 0.05)
     assert found["collisions"].sum() == 0
     assert states.done.mean() >= 0.75
+    assert np.all((states.pose_error != begun.pose_error) == bool(errors))
