@@ -146,7 +146,10 @@ class Travel:
             positive.
         """
         turn, straight, _ = self._way(pose, place)
-        path = straight + jnp.abs(to_go)
+        return self.duration(turn, straight + jnp.abs(to_go))
+
+    def duration(self, turn: Float[Array, "*B"], path: Float[Array, "*B"]) -> Float[Array, "*B"]:
+        """Seconds of a turn, in radians, a path, in metres, and a look."""
         return self.look_seconds + jnp.abs(turn) / self.turn_rate + path / self.speed
 
     def times(self, team: Team, to_go: Float[Array, "R N"]) -> Float[Array, "R N"]:

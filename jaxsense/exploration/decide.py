@@ -174,15 +174,13 @@ def _times(
     The robot's own by the lengths of its paths, in metres, those of others as if nothing stood
     between.
     """
-    look, is_look = make_travel(mission.config), jnp.arange(len(length)) < number
-    drive = dataclasses.replace(look, view_distance=0.0, look_seconds=0.0)
-    times = [x.times(team, jnp.zeros(team.heads.shape)) for x in (look, drive)]
-    pose = team.poses[robot]
+    pose, to_go = team.poses[robot], jnp.zeros(team.heads.shape)
     x, y = (team.positions - pose[None, :2]).T
     turn = within_a_turn(jnp.where(length > AT_GOAL, jnp.arctan2(y, x), yaw) - pose[2])
-    own = jnp.abs(turn) / look.turn_rate + length / look.speed
-    own += jnp.where(is_look, look.look_seconds, 0.0)
-    return jnp.where(is_look[None], *times).at[robot].set(own)
+    look = make_travel(mission.config)
+    drive = dataclasses.replace(look, view_distance=0.0, look_seconds=0.0)
+    times = [x.times(team, to_go).at[robot].set(x.duration(turn, length)) for x in (look, drive)]
+    return jnp.where((jnp.arange(len(length)) < number)[None], *times)
 
 
 def _shares(mission: Mission) -> Float[Array, " M"]:
