@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import jax
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
@@ -302,8 +303,8 @@ def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState])
     coloured once a class is likely.
     """
     shown = [states[round(i)] for i in np.linspace(0, len(states) - 1, min(4, len(states)))]
-    figure = Figure(figsize=(3.4 * len(shown), 3.6), layout="compressed")
-    half = config.arena.side / 2
+    figure = Figure(figsize=(3.4 * len(shown), 3.9), layout="compressed")
+    half, dots = config.arena.side / 2, dict[str, Artist]()
     for ax, state in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown, strict=True):
         grid, slots, layout = state.grid, state.slots, state.scene.layout
         floor = np.select([grid.evidence > 0, grid.evidence < 0], [0.1, 1.0], 0.6)
@@ -339,8 +340,9 @@ def explored(config: Config, fusion: Fusion, states: Sequence[ExplorationState])
             ahead = x + _HEADING * np.cos(yaw), y + _HEADING * np.sin(yaw)
             colour = modality_colour(modality)
             ax.plot(*zip((x, y), ahead, strict=True), color=colour)
-            ax.plot(x, y, "o", color=colour)
+            dots[config.modalities[modality]], *_ = ax.plot(x, y, "o", color=colour)
         ax.set(xlim=(-half, half), ylim=(-half, half), title=f"{float(state.time):.0f} s")
         ax.set(xticks=[], yticks=[])
+    figure.legend(dots.values(), dots, loc="outside upper right", ncols=len(dots), frameon=False)
     figure.supxlabel(_EXPLORED, fontsize=8)
     return figure
